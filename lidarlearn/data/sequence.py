@@ -1,0 +1,151 @@
+"""The two interfaces behind which every data set stands: a `Sequence` of scans and the `DataSet` it belongs to."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.geometry.projection import SphericalProjection
+
+Level = Literal["found", "odd", "missing"]
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One revolution of a spinning LiDAR.
+
+    Args:
+        points: float32 [m] in the sensor frame: x forward, y left, z up; finite.
+        times: when each point was measured, as a share of the scan period relative to the instant the scan's pose
+            refers to, e.g. in [-0.5, 0.5) where that is the middle of the sweep; None where scans are already
+            motion compensated or carry no times.
+        intensities: reflectance as the sensor gives it, in [0, 1]; None where there is none.
+    """
+
+    points: Float[Tensor, "n 3"]
+    times: Float[Tensor, "n"] | None = None
+    intensities: Float[Tensor, "n"] | None = None
+
+
+class Sequence(ABC):
+    """A drive: scans in the order of time, with ground truth where there is one.
+
+    Opening a sequence finds its files and reads poses and times; scans are read one by one, so that a sequence is
+    cheap to pickle into worker processes.
+
+    Attributes:
+        name: as on the command line, e.g. "08".
+        T_world_lidar: ground-truth poses (n, 4, 4), float64, the first one the identity; None where there are none.
+        timestamps: seconds of each scan (n,), float64; None where unknown.
+        T_reference_lidar: (4, 4) float64, from the LiDAR to the frame in which the data set publishes its poses and
+            its metric is defined: the left camera for KITTI odometry, the LiDAR itself (identity) elsewhere.
+        reference_frame: the name of that frame, "camera" or "lidar".
+    """
+
+    name: str
+    T_world_lidar: Float[Tensor, "n 4 4"] | None = None
+    timestamps: Float[Tensor, "n"] | None = None
+    T_reference_lidar: Float[Tensor, "4 4"] = torch.eye(4, dtype=torch.float64)
+    reference_frame: str = "lidar"
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of scans."""
+
+    @abstractmethod
+    def scan(self, index: int) -> Scan:
+        """Read one scan.
+
+        Raises:
+            DamagedFileError: the file is truncated, empty or holds values that are not finite.
+        """
+
+    @property
+    @abstractmethod
+    def fingerprint(self) -> str:
+        """Changes whenever a scan would come out differently: settings of the reader, files and their sizes."""
+
+    def __iter__(self) -> Iterator[Scan]:
+        return (self.scan(i) for i in range(len(self)))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of a layout check: what was looked at, what was seen, how bad it is."""
+
+    level: Level
+    what: str
+    detail: str
+
+
+@dataclass
+class LayoutReport:
+    """What a copy of a data set holds, what it lacks and what looks odd.
+
+    Args:
+        usable: whether the data can be used as configured.
+        findings: in the order in which they were made.
+    """
+
+    usable: bool = True
+    findings: list[Finding] = field(default_factory=list)
+
+    def found(self, what: str, detail: str) -> None:
+        """Note something as it should be."""
+        self.findings.append(Finding("found", what, detail))
+
+    def odd(self, what: str, detail: str) -> None:
+        """Note something unexpected that does not prevent use."""
+        self.findings.append(Finding("odd", what, detail))
+
+    def missing(self, what: str, detail: str) -> None:
+        """Note something without which the data cannot be used as configured."""
+        self.findings.append(Finding("missing", what, detail))
+        self.usable = False
+
+
+class DataSet(ABC):
+    """A data set on disk: opens sequences by name and says which serve for training, validation and test.
+
+    Every data set's constructor takes the attributes below under the same names, so that a setting means the same in
+    each of them; `configs/data/<name>.yaml` holds their values.
+
+    Attributes:
+        title: the data set, as its authors call it.
+        projection: the image of its sensor.
+        train_sequences: names of the sequences to train on.
+        val_sequences: names of the sequences by which the best checkpoint is chosen.
+        test_sequences: names of the sequences that an evaluation runs.
+        max_frames: keep only the first scans of each sequence; None keeps all.
+        deskew: whether odometries compensate the motion within a scan; only where scans carry times.
+        beam_correction_deg: angle by which each point is rotated to correct the intrinsic calibration [deg].
+    """
+
+    title: str
+    projection: SphericalProjection
+    train_sequences: tuple[str, ...]
+    val_sequences: tuple[str, ...]
+    test_sequences: tuple[str, ...]
+    max_frames: int | None
+    deskew: bool
+    beam_correction_deg: float
+
+    @abstractmethod
+    def sequence(self, name: str) -> Sequence:
+        """Open a sequence.
+
+        Raises:
+            DataSetNotFoundError: the sequence is not there.
+            DamagedFileError: its poses, times or calibration cannot be read.
+        """
+
+    @abstractmethod
+    def check(self) -> LayoutReport:
+        """Describe this copy without reading whole scans: found, missing, odd."""
+
+    def prepare(self) -> None:  # noqa: B027 - most data sets have nothing to do
+        """Make what can be made on the spot (simulated scans); called once, before any sequence is opened."""

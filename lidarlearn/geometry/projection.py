@@ -1,0 +1,88 @@
+"""Spherical projection of a scan into an image, one nearest point per pixel."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+# Marks a pixel into which no point fell: larger than any packed (range, index) key.
+_EMPTY = torch.iinfo(torch.int64).max
+
+
+@dataclass(frozen=True)
+class SphericalProjection:
+    """The image of a spinning LiDAR: rows are elevations, columns azimuths that wrap at the seam behind the sensor.
+
+    column = (1 - atan2(y, x)/pi)/2 * width; row = (fov_up - asin(z/r)) / (fov_up - fov_down) * height.
+
+    Args:
+        height: rows [px].
+        width: columns [px].
+        fov_up_deg: elevation of the upper image border, above the horizon positive [deg].
+        fov_down_deg: elevation of the lower image border [deg].
+
+    Source: Dellenbach et al. 2021, III-A "Local map and neighborhood": 64x720 px for the HDL-64.
+    """
+
+    height: int = 64
+    width: int = 720
+    fov_up_deg: float = 3.0
+    fov_down_deg: float = -24.0
+
+    def __post_init__(self) -> None:
+        if self.height < 1 or self.width < 1 or self.fov_up_deg <= self.fov_down_deg:
+            raise ValueError(f"a projection needs height, width >= 1 and fov_up_deg > fov_down_deg, got {self}")
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of the image."""
+        return self.height * self.width
+
+    def pixel_index(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch n"]:
+        """Flat index row * width + column of each point's pixel; -1 outside the field of view and at the origin."""
+        x, y, z = points.unbind(-1)
+        ground_range = torch.hypot(x, y)
+        column = ((1 - torch.atan2(y, x) / math.pi) * (self.width / 2)).long() % self.width
+        fov_up, fov_down = math.radians(self.fov_up_deg), math.radians(self.fov_down_deg)
+        elevation = torch.atan2(z, ground_range)
+        row = ((fov_up - elevation) * (self.height / (fov_up - fov_down))).floor().long()
+        inside = (row >= 0) & (row < self.height) & ((ground_range > 0) | (z != 0))
+        return torch.where(inside, row * self.width + column, -1)
+
+    def nearest_points(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch h w"]:
+        """Index into `points` of the nearest point of each pixel, -1 where no point fell.
+
+        Deterministic on every device: the minimum of (range, index) packed into one integer wins, so equal ranges go
+        to the smaller index, whatever the order of execution.
+        """
+        pixel = self.pixel_index(points)
+        n = points.shape[-2]
+        range_bits = points.detach().float().norm(dim=-1).view(torch.int32).long()  # ordered like the floats
+        key = (range_bits << 32) | torch.arange(n, device=points.device)
+        # Points outside go to one slot past the image.
+        pixel = torch.where(pixel < 0, self.pixels, pixel)
+        image = torch.full((*pixel.shape[:-1], self.pixels + 1), _EMPTY, device=points.device)
+        image = image.scatter_reduce(-1, pixel, key, "amin")[..., :-1]
+        index = torch.where(image == _EMPTY, -1, image & 0xFFFFFFFF)
+        return index.unflatten(-1, (self.height, self.width))
+
+    def vertex_map(self, points: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3 h w"]:
+        """Coordinates [m] of the nearest point of each pixel, zeros where no point fell; differentiable."""
+        index = self.nearest_points(points).flatten(-2)
+        if points.shape[-2] == 0:
+            return points.new_zeros(*points.shape[:-2], 3, self.height, self.width)
+        gathered = points.gather(-2, index.clamp(min=0)[..., None].expand(*index.shape, 3))
+        filled = torch.where((index >= 0)[..., None], gathered, 0.0)
+        return filled.mT.unflatten(-1, (self.height, self.width))
+
+
+def activated(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Bool[Tensor, "*batch h w"]:
+    """Pixels into which a point fell. Invalid pixels are exact zeros in all three coordinates."""
+    return (vertex_map != 0).any(dim=-3)
+
+
+def points_of(vertex_map: Float[Tensor, "3 h w"]) -> Float[Tensor, "n 3"]:
+    """The points of the activated pixels, in row-major order."""
+    return vertex_map[:, activated(vertex_map)].T

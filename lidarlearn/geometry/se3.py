@@ -1,0 +1,141 @@
+"""Rigid motions: SE(3) as 4x4 matrices, its tangent vectors, and the network's Euler angles.
+
+Tangent vectors are ordered (translation, rotation). All functions are batched, differentiable (also at the identity)
+and keep the dtype and device of their arguments. Poses are float64 by convention, see `lidarlearn.odometry`.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+# Below this angle [rad] closed forms lose digits to cancellation and Taylor series take over.
+_SMALL_ANGLE = 1e-2
+
+
+def identity(*batch: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Tensor:
+    """Identity transforms of shape (*batch, 4, 4)."""
+    return torch.eye(4, dtype=dtype, device=device).expand(*batch, 4, 4).clone()
+
+
+def from_rotation_translation(
+    R: Float[Tensor, "*batch 3 3"], t: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """The transform x -> R x + t."""
+    top = torch.cat([R, t[..., None]], dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1
+    return torch.cat([top, bottom], dim=-2)
+
+
+def inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """`T_b_a` from `T_a_b`, by transposing the rotation."""
+    R_inv = T[..., :3, :3].mT
+    return from_rotation_translation(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
+
+
+def transform(T_target_source: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch n 3"]) -> Tensor:
+    """Points in the target frame, in the dtype of the points.
+
+    The product is taken in the dtype of the points: cheap for a scan of float32 points under a float64 pose.
+    """
+    T = T_target_source.to(points.dtype)
+    return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
+
+
+def hat(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The matrix of the cross product: hat(v) w = v x w."""
+    x, y, z = v.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+
+
+def exp(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+    """The motion after unit time under the constant twist xi = (translation [m], rotation [rad])."""
+    rho, phi = xi[..., :3], xi[..., 3:]
+    W = hat(phi)
+    W2 = W @ W
+    a, b, c = _series(phi)
+    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+    R = eye + a * W + b * W2
+    V = eye + b * W + c * W2
+    return from_rotation_translation(R, (V @ rho[..., None])[..., 0])
+
+
+def log(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
+    """The twist (translation [m], rotation [rad]) whose `exp` is T; rotations up to but not including pi."""
+    phi = rotation_log(T[..., :3, :3])
+    W = hat(phi)
+    a, b, _ = _series(phi)
+    squared = (phi * phi).sum(-1)[..., None, None]
+    small = squared < _SMALL_ANGLE**2
+    safe = torch.where(small, torch.ones_like(squared), squared)
+    d = torch.where(small, 1 / 12 + squared / 720, (1 - a / (2 * b)) / safe)
+    V_inv = torch.eye(3, dtype=T.dtype, device=T.device) - W / 2 + d * (W @ W)
+    return torch.cat([(V_inv @ T[..., :3, 3:])[..., 0], phi], dim=-1)
+
+
+def rotation_log(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Rotation vector [rad] of a rotation matrix, accurate for tiny angles where acos of the trace is not."""
+    twice_sin_axis = torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], dim=-1
+    )
+    sin2 = (twice_sin_axis * twice_sin_axis).sum(-1, keepdim=True) / 4
+    cos = (R.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
+    small = (sin2 < _SMALL_ANGLE**2) & (cos > 0)
+    sin = torch.where(small, torch.ones_like(sin2), sin2).sqrt()  # the double where keeps gradients finite
+    angle_over_sin = torch.where(small, 1 + sin2 / 6 + 3 * sin2 * sin2 / 40, torch.atan2(sin, cos) / sin)
+    return angle_over_sin * twice_sin_axis / 2
+
+
+def rotation_angle(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
+    """Rotation angle [rad] of a transform, in [0, pi)."""
+    return rotation_log(T[..., :3, :3]).norm(dim=-1)
+
+
+def from_euler(parameters: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+    """Transform of (x, y, z [m], roll, pitch, yaw [rad]) with R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Source: Dellenbach et al. 2021, III-B: the six outputs of PoseNet.
+    """
+    cx, cy, cz = parameters[..., 3:].cos().unbind(-1)
+    sx, sy, sz = parameters[..., 3:].sin().unbind(-1)
+    rows = [
+        [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
+        [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
+        [-sy, cy * sx, cy * cx],
+    ]
+    R = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    return from_rotation_translation(R, parameters[..., :3])
+
+
+def to_euler(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
+    """Inverse of `from_euler` for pitch angles within (-pi/2, pi/2)."""
+    roll = torch.atan2(T[..., 2, 1], T[..., 2, 2])
+    pitch = torch.atan2(-T[..., 2, 0], torch.hypot(T[..., 0, 0], T[..., 1, 0]))
+    yaw = torch.atan2(T[..., 1, 0], T[..., 0, 0])
+    return torch.cat([T[..., :3, 3], torch.stack([roll, pitch, yaw], dim=-1)], dim=-1)
+
+
+def relative(T_world: Float[Tensor, "n 4 4"]) -> Float[Tensor, "m 4 4"]:
+    """Relative poses `T_i_(i+1)` of consecutive absolute poses `T_world_i`; one fewer than given."""
+    return inverse(T_world[:-1]) @ T_world[1:]
+
+
+def accumulate(T_relative: Float[Tensor, "m 4 4"]) -> Float[Tensor, "n 4 4"]:
+    """Absolute poses that start at the identity from consecutive relative poses; one more than given."""
+    poses = [torch.eye(4, dtype=T_relative.dtype, device=T_relative.device)]
+    for T in T_relative:
+        poses.append(poses[-1] @ T)
+    return torch.stack(poses)
+
+
+def _series(phi: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
+    """sin(x)/x, (1-cos x)/x^2, (x-sin x)/x^3 of x = |phi|, each of shape (*batch, 1, 1)."""
+    squared = (phi * phi).sum(-1)[..., None, None]
+    small = squared < _SMALL_ANGLE**2
+    safe = torch.where(small, torch.ones_like(squared), squared)  # the double where keeps gradients finite
+    x = safe.sqrt()
+    a = torch.where(small, 1 - squared / 6 + squared**2 / 120, x.sin() / x)
+    b = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - x.cos()) / safe)
+    c = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (x - x.sin()) / (x * safe))
+    return a, b, c

@@ -1,0 +1,15 @@
+"""Fixtures that several packages' tests share."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real scans; tests that need it are marked `realdata` and skip without it."""
+    folder = os.environ.get("LIDARLEARN_TEST_DATA")
+    if not folder:
+        pytest.skip("set LIDARLEARN_TEST_DATA to the folder of real scans to run this test")
+    return Path(folder)
