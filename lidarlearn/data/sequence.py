@@ -89,10 +89,12 @@ class LayoutReport:
     Args:
         usable: whether the data can be used as configured.
         findings: in the order in which they were made.
+        remedy: what to change where it is not usable; "" where there is nothing better to say than the findings.
     """
 
     usable: bool = True
     findings: list[Finding] = field(default_factory=list)
+    remedy: str = ""
 
     def found(self, what: str, detail: str) -> None:
         """Note something as it should be."""

@@ -50,9 +50,9 @@ def fit_planes(covariances: Float[Tensor, "*batch 6"]) -> PlaneFit:
 
 def normal_map(
     vertex_map: Float[Tensor, "*batch 3 h w"],
-    window: tuple[int, int] = (3, 5),
-    max_range_jump: float = 0.15,
-    max_roughness: float = 0.15,
+    window: tuple[int, int] = (3, 3),
+    max_range_jump: float = 0.05,
+    max_roughness: float = 0.5,
 ) -> Float[Tensor, "*batch 3 h w"]:
     """Unit normals from the activated pixels around each pixel, pointing towards the sensor, zeros where undefined.
 
@@ -63,7 +63,8 @@ def normal_map(
         vertex_map: points [m] in the sensor frame, zeros where no point fell.
         window: rows and columns of the neighbourhood [px], odd; columns wrap at the seam.
         max_range_jump: neighbours count if their range differs by less than this share of the pixel's own range.
-        max_roughness: largest accepted ratio of the deviation from the plane to the patch's smaller extent in it.
+        max_roughness: largest accepted ratio of the deviation from the plane to the patch's smaller extent in it;
+            generous, because poles and trunks are no planes but hold a car's motion along the road.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood".
     """

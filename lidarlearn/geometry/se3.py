@@ -33,6 +33,16 @@ def inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     return from_rotation_translation(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
 
 
+def orthonormalize(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """The nearest transform with a proper rotation.
+
+    Products of poses drift from SO(3) by rounding, and a constant-velocity prediction, in which each pose stands
+    twice, doubles that drift with every frame: a trajectory must be brought back as it grows.
+    """
+    U, _, Vh = torch.linalg.svd(T[..., :3, :3])
+    return from_rotation_translation(U @ Vh, T[..., :3, 3])
+
+
 def transform(T_target_source: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch n 3"]) -> Tensor:
     """Points in the target frame, in the dtype of the points.
 

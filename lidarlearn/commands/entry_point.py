@@ -1,0 +1,82 @@
+"""What the commands share: a Hydra application whose users read one error instead of a stack trace."""
+
+import os
+import sys
+from collections.abc import Callable
+
+import hydra
+from hydra.errors import HydraException, InstantiationException
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from lidarlearn.commands.configs import config_directory
+from lidarlearn.errors import UserError
+
+_FULL_ERROR = "HYDRA_FULL_ERROR"
+
+# Causes of a failed instantiation that a setting can mend; any other is a defect and keeps its stack trace.
+_SETTINGS_AT_FAULT = (UserError, TypeError, ValueError, ImportError, MisconfigurationException)
+
+
+def run(task: Callable[[DictConfig], None], config_name: str) -> None:
+    """Compose the configuration from the command line and run the task with it, once or for every job of a multirun.
+
+    What the user can mend is printed as one message, and the process exits with 1: a `UserError`, a typo in a group or
+    a key, settings that do not fit together. Everything else keeps its stack trace, and so does everything when the
+    environment variable HYDRA_FULL_ERROR is 1.
+
+    Args:
+        task: takes the composed configuration.
+        config_name: of the primary config in `configs/`.
+    """
+    if os.environ.get(_FULL_ERROR) == "1":
+        _application(task, config_name)()
+        return
+
+    def task_with_readable_errors(config: DictConfig) -> None:
+        try:
+            task(config)
+        except Exception as error:  # Hydra would announce the error before it hands it on
+            _exit_if_readable(error)
+            raise
+
+    os.environ[_FULL_ERROR] = "1"  # Hydra hands its errors on instead of printing them in its own way
+    try:
+        _application(task_with_readable_errors, config_name)()
+    except Exception as error:
+        _exit_if_readable(error)
+        raise
+    finally:
+        del os.environ[_FULL_ERROR]
+
+
+def readable_message(error: Exception) -> str | None:
+    """What to tell the user, None where the error is a defect.
+
+    Raised by Hydra or OmegaConf, it is about the command line or a yaml: their hints for programmers are left out.
+    """
+    if isinstance(error, UserError):
+        return str(error)
+    if isinstance(error, InstantiationException):
+        cause = error.__cause__
+        if not isinstance(cause, _SETTINGS_AT_FAULT):
+            return None
+        key = next((line for line in str(error).splitlines() if line.startswith("full_key:")), "")
+        reason = str(cause) if isinstance(cause, UserError | MisconfigurationException) else f"{cause}"
+        return "  ".join(part for part in (reason, key.replace("full_key:", "in the config node")) if part)
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        lines = [line.strip() for line in str(error).splitlines()]
+        return "  ".join(line for line in lines if line and not line.startswith(("See https", "object_type=", "^")))
+    return None
+
+
+def _application(task: Callable[[DictConfig], None], config_name: str) -> Callable[[], None]:
+    return hydra.main(version_base="1.3", config_path=str(config_directory()), config_name=config_name)(task)
+
+
+def _exit_if_readable(error: Exception) -> None:
+    message = readable_message(error)
+    if message is not None:
+        print(f"error: {message}", file=sys.stderr, flush=True)
+        sys.exit(1)

@@ -1,0 +1,29 @@
+"""What every run leaves in its folder besides its results: the effective config and the revision of the code."""
+
+import subprocess
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+_SOURCE = Path(__file__).resolve().parent
+
+
+def git_revision() -> str:
+    """Commit of the code that runs, marked "-modified" where files differ from it; "unknown" outside of a clone."""
+    try:
+        commit = _git("rev-parse", "HEAD")
+        return f"{commit}-modified" if _git("status", "--porcelain", "--untracked-files=no") else commit
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def write_run_description(folder: Path, config: DictConfig) -> None:
+    """Write `config.yaml`, every setting of the run with its value, and `git_revision.txt`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    OmegaConf.save(config, folder / "config.yaml", resolve=True)
+    (folder / "git_revision.txt").write_text(git_revision() + "\n")
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(_SOURCE), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()

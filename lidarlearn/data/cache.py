@@ -1,0 +1,183 @@
+"""Vertex maps on disk: each scan is read and projected once, then mapped into memory at every epoch."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from filelock import FileLock, Timeout
+from jaxtyping import Float, Int16
+from rich.progress import track
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from lidarlearn.data.sequence import Sequence
+from lidarlearn.errors import UserError
+from lidarlearn.geometry.projection import SphericalProjection
+
+QUANTUM_M = 0.004
+"""Coordinates are stored in multiples of this [m]: below a sensor's noise, and 16 bits reach 131 m."""
+
+_VERSION = 1  # of the format; a new one leaves old caches alone
+_CHUNK = 32  # frames between two notes of what is done: at most so many are projected again after a kill
+_SPARE_BYTES = 50_000_000
+
+
+class VertexMaps:
+    """The vertex maps of a sequence, mapped from a file: costs no memory and travels to workers as a path.
+
+    Args:
+        file: the .npy file of shape (n, 3, h, w), int16.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._maps = np.load(file, mmap_mode="r")
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    def __getitem__(self, index: int) -> Int16[Tensor, "3 h w"]:
+        return torch.from_numpy(np.array(self._maps[index]))
+
+    def __reduce__(self) -> tuple[type["VertexMaps"], tuple[Path]]:
+        return VertexMaps, (self.file,)
+
+
+def encode(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Int16[Tensor, "*batch 3 h w"]:
+    """Metres to multiples of `QUANTUM_M`; points beyond the range of 16 bits become empty pixels."""
+    multiples = (vertex_map / QUANTUM_M).round()
+    inside = (multiples.abs() <= torch.iinfo(torch.int16).max).all(dim=-3, keepdim=True)
+    return torch.where(inside, multiples, 0).to(torch.int16)
+
+
+def decode(multiples: Int16[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
+    """Multiples of `QUANTUM_M` to metres, float32; empty pixels stay exact zeros."""
+    return multiples.to(torch.float32) * QUANTUM_M
+
+
+def cached_vertex_maps(
+    sequence: Sequence, projection: SphericalProjection, cache_root: Path, num_workers: int = 0
+) -> VertexMaps:
+    """The vertex maps of all scans of a sequence, projected now as far as they are not on disk yet.
+
+    The folder's name is a fingerprint of the scans and of the projection: other settings make another cache. Any
+    number of processes may ask at once: one projects, the others wait. A process killed half-way leaves what it had
+    finished to the next one.
+
+    Args:
+        sequence: whose scans are projected.
+        projection: the image to project them into.
+        cache_root: folder of all caches; made where missing.
+        num_workers: processes that read and project; 0 does it in this one.
+
+    Raises:
+        DamagedFileError: a scan cannot be read.
+        UserError: the disk is too small.
+    """
+    folder = cache_root / _fingerprint(sequence, projection)
+    if not _complete(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with _locked(folder / ".lock", sequence.name):
+            if not _complete(folder):
+                _build(folder, sequence, projection, num_workers)
+    return VertexMaps(folder / "vertex_maps.npy")
+
+
+def _fingerprint(sequence: Sequence, projection: SphericalProjection) -> str:
+    settings = json.dumps([_VERSION, QUANTUM_M, sequence.fingerprint, len(sequence), asdict(projection)])
+    return hashlib.sha256(settings.encode()).hexdigest()[:24]
+
+
+def _complete(folder: Path) -> bool:
+    try:
+        return (folder / "vertex_maps.npy").exists() and bool(np.load(folder / "done.npy").all())
+    except (OSError, ValueError, EOFError):  # not there, or just being made
+        return False
+
+
+@contextmanager
+def _locked(file: Path, name: str) -> Iterator[None]:
+    """Hold a lock; say so when another process makes this one wait."""
+    lock = FileLock(file)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        print(f"sequence {name}: waiting for another process that projects it", flush=True)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _build(folder: Path, sequence: Sequence, projection: SphericalProjection, num_workers: int) -> None:
+    """Project what is missing. Frames are flushed to disk before they are noted as done."""
+    shape = (len(sequence), 3, projection.height, projection.width)
+    if not (folder / "vertex_maps.npy").exists():
+        (folder / "done.npy").unlink(missing_ok=True)
+    maps = _open(folder / "vertex_maps.npy", shape, np.int16)
+    done = _open(folder / "done.npy", shape[:1], np.bool_)
+    (folder / "settings.json").write_text(
+        json.dumps({"sequence": sequence.name, "fingerprint": sequence.fingerprint, **asdict(projection)}, indent=2)
+    )
+    missing = np.flatnonzero(~done).tolist()
+    scans = DataLoader(
+        _ProjectedScans(sequence, projection, missing), batch_size=None, num_workers=min(num_workers, len(missing))
+    )
+    finished: list[int] = []
+    for index, vertex_map in track(scans, f"projecting sequence {sequence.name}", total=len(missing)):
+        if isinstance(vertex_map, UserError):
+            raise vertex_map
+        maps[index] = vertex_map.numpy()
+        finished.append(index)
+        if len(finished) % _CHUNK == 0 or len(finished) == len(missing):
+            maps.flush()
+            done[finished[-_CHUNK:]] = True
+            done.flush()
+
+
+def _open(file: Path, shape: tuple[int, ...], dtype: type) -> np.memmap:
+    """A .npy file mapped for writing: the one that is there if it fits, else a new one of zeros."""
+    if file.exists():
+        try:
+            array = np.lib.format.open_memmap(file, mode="r+")
+            if array.shape == shape and array.dtype == dtype:
+                return array
+        except ValueError:  # killed while the file was being made
+            pass
+    needed = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    free = shutil.disk_usage(file.parent).free
+    if free < needed + _SPARE_BYTES:  # a full disk under a mapped file kills the process without a word
+        raise UserError(
+            f"{file.parent.absolute()}: {needed / 1e9:.2f} GB of vertex maps do not fit, {free / 1e9:.2f} GB are free."
+            "\n  change: datamodule.cache_root=/path/with/room, or train on fewer scans (data.max_frames)"
+        )
+    return np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=shape)
+
+
+class _ProjectedScans(Dataset[tuple[int, Tensor | UserError]]):
+    """Encoded vertex maps of chosen scans. What the user can mend is handed over as a value.
+
+    Raised in a worker it would come out as another type, with the worker's stack trace for its message.
+    """
+
+    def __init__(self, sequence: Sequence, projection: SphericalProjection, indices: list[int]) -> None:
+        self.sequence = sequence
+        self.projection = projection
+        self.indices = indices
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, position: int) -> tuple[int, Tensor | UserError]:
+        index = self.indices[position]
+        try:
+            return index, encode(self.projection.vertex_map(self.sequence.scan(index).points))
+        except UserError as error:
+            return index, UserError(str(error))

@@ -1,0 +1,126 @@
+"""Point clouds in the formats that tools exchange: .bin, .npy, .pcd and .ply, with the fields that matter here."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import meshio.ply
+import numpy as np
+import torch
+from jaxtyping import Float
+from meshio import ReadError
+from numpy.typing import NDArray
+from pypcd4 import PointCloud
+from torch import Tensor
+
+from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.scan_files import read_float32_rows
+
+SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
+_INTENSITY_NAMES = ("intensity", "scalar_intensity", "intensities", "reflectivity", "reflectance")
+_TIME_NAMES = ("t", "time", "timestamp", "time_stamp", "timestamps", "offset_time", "scalar_time", "scalar_timestamp")
+_HEADER_BYTES = 4096  # of a .ply, in which the number of points is looked for
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The returns of a scan as a file holds them.
+
+    Args:
+        points: float32 [m], finite, without the origin: it stands for "no return".
+        intensities: as they stand; None where there are none.
+        times: as they stand, in the file's unit and from its origin, float64; None where there are none.
+    """
+
+    points: Float[Tensor, "n 3"]
+    intensities: Float[Tensor, "n"] | None
+    times: Float[Tensor, "n"] | None
+
+
+def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
+    """Read a scan in the format that its name says.
+
+    Args:
+        path: .bin (float32 rows x, y, z, intensity, ...), .npy (the same as an array), .pcd or .ply.
+        bin_columns: numbers per point of a .bin file: 4 as in KITTI, 5 as in nuScenes.
+
+    Raises:
+        DamagedFileError: not such a file, no return in it, or (.bin and .npy) a point that is not finite. In .pcd and
+            .ply that is a common way to say "no return".
+    """
+    match path.suffix.lower():
+        case ".bin":
+            fields = _columns(read_float32_rows(path, bin_columns).numpy())
+        case ".npy":
+            fields = _read_npy(path)
+        case ".pcd":
+            fields = _read_pcd(path)
+        case ".ply":
+            fields = _read_ply(path)
+        case _:
+            raise DamagedFileError(path, f"not one of {', '.join(SUFFIXES)}")
+    return _cloud(path, fields)
+
+
+def _cloud(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
+    """Names that tools use, in lower case, reduced to the ones we know, and the returns alone."""
+    if not {"x", "y", "z"} <= fields.keys():
+        raise DamagedFileError(path, f"no fields x, y and z, only {', '.join(fields)}")
+    points = torch.from_numpy(np.stack([np.asarray(fields[axis], np.float32) for axis in "xyz"], axis=1))
+    returned = points.isfinite().all(dim=1) & (points != 0).any(dim=1)
+    if not returned.any():
+        raise DamagedFileError(path, "a scan without a single return")
+    intensities, times = (
+        next((torch.from_numpy(np.asarray(fields[n]).astype(dtype))[returned] for n in names if n in fields), None)
+        for names, dtype in ((_INTENSITY_NAMES, np.float32), (_TIME_NAMES, np.float64))
+    )
+    return Cloud(points[returned], intensities, times)
+
+
+def _columns(rows: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
+    return {name: rows[:, i] for i, name in enumerate(("x", "y", "z", "intensity")[: rows.shape[1]])}
+
+
+def _read_npy(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        rows = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DamagedFileError(path, f"no array of numbers ({error})") from error
+    if rows.ndim != 2 or rows.shape[1] < 3 or rows.dtype.kind not in "fiu":
+        raise DamagedFileError(path, f"an array {rows.shape} of {rows.dtype}, not (n, 3 or more) numbers")
+    if not np.isfinite(rows[:, :4]).all():
+        raise DamagedFileError(path, "points that are not finite")
+    return _columns(rows.astype(np.float32))
+
+
+def _read_pcd(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        cloud = PointCloud.from_path(path)
+    except Exception as error:  # its errors are of many kinds, none of them its own
+        raise DamagedFileError(path, f"no .pcd file, or truncated ({_first_line(error)})") from error
+    _require_points(path, len(cloud.pc_data), cloud.metadata.points)
+    return {name.lower(): cloud.pc_data[name] for name in cloud.fields}
+
+
+def _read_ply(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        mesh = meshio.ply.read(path)
+        with path.open("rb") as file:
+            declared = re.search(rb"element vertex (\d+)", file.read(_HEADER_BYTES))
+    except (ReadError, OSError, ValueError, IndexError, KeyError, TypeError) as error:
+        raise DamagedFileError(path, f"no .ply file, or truncated ({_first_line(error)})") from error
+    if declared is not None:
+        _require_points(path, len(mesh.points), int(declared[1]))
+    axes = {axis: mesh.points[:, i] for i, axis in enumerate("xyz"[: mesh.points.shape[1]])}
+    return axes | {name.lower(): values for name, values in mesh.point_data.items()}
+
+
+def _require_points(path: Path, found: int, declared: int) -> None:
+    if found != declared:
+        raise DamagedFileError(path, f"truncated: {found} points where its header says {declared}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

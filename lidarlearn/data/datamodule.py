@@ -1,0 +1,118 @@
+"""The pairs of a data set's sequences as Lightning wants them."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningDataModule
+from torch import Tensor
+from torch.utils.data import ConcatDataset, DataLoader
+
+from lidarlearn.data import cache
+from lidarlearn.data.pairs import Pair, ScanPairs
+from lidarlearn.data.sequence import DataSet, Sequence
+from lidarlearn.errors import UserError
+from lidarlearn.geometry.projection import SphericalProjection
+
+
+class OdometryDataModule(LightningDataModule):
+    """Training pairs shuffled over all training sequences; each validation sequence on its own, in order.
+
+    Batches reach the device as 16-bit integers and are decoded there.
+
+    Args:
+        data: the data set.
+        batch_size: pairs of a batch.
+        num_workers: processes that load batches; 0 loads them in the training process.
+        cache_root: folder of the vertex maps' caches.
+        height: rows of the network's image [px]; None takes the data set's.
+        width: its columns [px]; None takes the data set's.
+        mirror: mirror every other training pair, by chance; see `ScanPairs`.
+        preparation_workers: processes that project scans into the cache; None takes one per core.
+    """
+
+    def __init__(
+        self,
+        data: DataSet,
+        batch_size: int = 8,
+        num_workers: int = 2,
+        cache_root: str = "datasets/cache",
+        height: int | None = None,
+        width: int | None = None,
+        mirror: bool = True,
+        preparation_workers: int | None = None,
+    ) -> None:
+        super().__init__()
+        self.data = data
+        self.batch_size = batch_size
+        self.num_workers = num_workers
+        self.cache_root = Path(cache_root).expanduser()
+        self.mirror = mirror
+        self.preparation_workers = _usable_cores() if preparation_workers is None else preparation_workers
+        self.projection: SphericalProjection = replace(
+            data.projection, height=height or data.projection.height, width=width or data.projection.width
+        )
+        self.val_sequences: list[Sequence] = []
+
+    def prepare_data(self) -> None:
+        """Make the data, where it is made on the spot, and the caches; Lightning calls it in one process only.
+
+        Raises:
+            DataSetNotFoundError: something that is needed is missing.
+            DamagedFileError: a scan, or poses, cannot be read.
+        """
+        self.data.prepare()
+        for name in dict.fromkeys([*self.data.train_sequences, *self.data.val_sequences]):
+            self._vertex_maps(self.data.sequence(name))
+
+    def setup(self, stage: str | None = None) -> None:
+        """Open sequences and caches; called in every process."""
+        train = [self.data.sequence(name) for name in self.data.train_sequences]
+        # One sequence without ground truth and the batches of all go without: a batch holds the same for every pair.
+        labelled = all(sequence.T_world_lidar is not None for sequence in train)
+        self._train_pairs = ConcatDataset([self._pairs(s, labelled, self.mirror) for s in train])
+        if not len(self._train_pairs):
+            raise UserError(
+                f"{self.data.title}: no pair of scans to train on in sequences {list(self.data.train_sequences)}"
+                "\n  change: data.train_sequences, or data.max_frames"
+            )
+        self.val_sequences = [self.data.sequence(name) for name in self.data.val_sequences]
+        self._val_pairs = [self._pairs(s, s.T_world_lidar is not None, mirror=False) for s in self.val_sequences]
+
+    def train_dataloader(self) -> DataLoader[Pair]:
+        """Shuffled pairs of all training sequences; a last, smaller batch is left out."""
+        return self._loader(self._train_pairs, shuffle=True, drop_last=len(self._train_pairs) > self.batch_size)
+
+    def val_dataloader(self) -> list[DataLoader[Pair]]:
+        """One loader per validation sequence, in the order of `val_sequences`."""
+        return [self._loader(pairs) for pairs in self._val_pairs]
+
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
+        """Decode vertex maps to metres, on the device: half the traffic to it."""
+        maps: dict[str, Tensor] = {key: cache.decode(batch[key]) for key in ("reference", "target")}
+        return {**batch, **maps}
+
+    def _pairs(self, sequence: Sequence, labelled: bool, mirror: bool) -> ScanPairs:
+        return ScanPairs(self._vertex_maps(sequence), sequence.T_world_lidar if labelled else None, mirror)
+
+    def _vertex_maps(self, sequence: Sequence) -> cache.VertexMaps:
+        return cache.cached_vertex_maps(sequence, self.projection, self.cache_root, self.preparation_workers)
+
+    def _loader(
+        self, pairs: ScanPairs | ConcatDataset[Pair], shuffle: bool = False, drop_last: bool = False
+    ) -> DataLoader[Pair]:
+        return DataLoader(
+            pairs,
+            batch_size=self.batch_size,
+            shuffle=shuffle,
+            drop_last=drop_last,
+            num_workers=self.num_workers,
+            persistent_workers=self.num_workers > 0,
+            pin_memory=torch.cuda.is_available(),
+        )
+
+
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,249 @@
+"""A folder of scans from anywhere: .bin, .npy, .pcd or .ply in natural name order, ground truth where there is some.
+
+On disk: either every subfolder with scans in it is a sequence, or the folder itself is one. Beside its scans a sequence
+may have `times.txt` (a time [s] per scan) and ground truth of the LiDAR's own poses, in KITTI's or TUM's format:
+`poses.txt`, `poses.tum`, `groundtruth.txt` with the scans, or `<sequence>.txt`, `<sequence>.tum` beside its folder.
+KITTI rows belong to the scans in order; TUM rows are interpolated at the scans' times, or belong to the scans in order
+where these have no times. Poses relate to the middle of a sweep.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.data import layout
+from lidarlearn.data.beam_correction import raise_beams
+from lidarlearn.data.cloud_files import SUFFIXES, read_cloud
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.interpolation import interpolate_poses
+from lidarlearn.data.pose_files import read_kitti_poses, read_numbers, read_tum_poses, start_at_identity
+from lidarlearn.data.scan_files import ScanFiles, holds_scans, list_scans, sequence_names, subfolders
+from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.errors import UserError
+from lidarlearn.geometry.projection import SphericalProjection
+
+_SOURCE = "your own recordings: one folder of .bin, .npy, .pcd or .ply files for each sequence"
+_TRUTH_INSIDE = ("poses.txt", "poses.tum", "groundtruth.txt")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FolderSequence(Sequence):
+    """The scans of one folder.
+
+    Args:
+        name: of the folder.
+        scans: its files.
+        T_world_lidar: ground truth; None where there is none.
+        timestamps: from times.txt [s]; None where there is none.
+        bin_columns: numbers per point of a .bin file.
+        max_intensity: the value of full reflectance; None leaves intensities out.
+        beam_correction_deg: angle by which every beam is raised.
+    """
+
+    name: str
+    scans: ScanFiles
+    T_world_lidar: Float[Tensor, "n 4 4"] | None
+    timestamps: Float[Tensor, "n"] | None
+    bin_columns: int
+    max_intensity: float | None
+    beam_correction_deg: float
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan, with point times relative to the middle of the sweep where the file has any."""
+        cloud = read_cloud(self.scans.path(index), self.bin_columns)
+        intensities = None
+        if self.max_intensity is not None and cloud.intensities is not None:
+            intensities = (cloud.intensities / self.max_intensity).clamp(0, 1)
+        return Scan(
+            raise_beams(cloud.points, self.beam_correction_deg),
+            times=None if cloud.times is None else relative_times(cloud.times),
+            intensities=intensities,
+        )
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the files and of all settings."""
+        return self.scans.fingerprint(
+            "Folder",
+            bin_columns=self.bin_columns,
+            max_intensity=self.max_intensity,
+            beam_correction_deg=self.beam_correction_deg,
+        )
+
+
+class Folder(DataSet):
+    """A folder of scans.
+
+    Args:
+        root: a folder of scans, or of such folders.
+        projection: the image of the sensor.
+        train_sequences: names of subfolders; None takes all there are, or the folder itself.
+        val_sequences: likewise.
+        test_sequences: likewise.
+        max_frames: keep only the first scans of each sequence; None keeps all.
+        deskew: whether odometries compensate the motion within a scan; only where the files carry point times.
+        beam_correction_deg: angle by which every beam is raised.
+        bin_columns: numbers per point of a .bin file: 4 as in KITTI, 5 as in nuScenes.
+        max_intensity: the value of full reflectance, e.g. 255; None leaves intensities out.
+    """
+
+    title = "folder of scans"
+
+    def __init__(
+        self,
+        root: str | Path,
+        projection: SphericalProjection,
+        train_sequences: Iterable[str | int] | None = None,
+        val_sequences: Iterable[str | int] | None = None,
+        test_sequences: Iterable[str | int] | None = None,
+        max_frames: int | None = None,
+        deskew: bool = False,
+        beam_correction_deg: float | int = 0.0,
+        bin_columns: int = 4,
+        max_intensity: float | int | None = None,
+    ) -> None:
+        self.root = Path(root)
+        self.projection = projection
+        there = find_sequences(self.root) or (self.root.absolute().name,)
+        self.train_sequences = there if train_sequences is None else sequence_names(train_sequences)
+        self.val_sequences = there if val_sequences is None else sequence_names(val_sequences)
+        self.test_sequences = there if test_sequences is None else sequence_names(test_sequences)
+        self.max_frames = max_frames
+        self.deskew = deskew
+        self.beam_correction_deg = float(beam_correction_deg)
+        self.bin_columns = bin_columns
+        self.max_intensity = None if max_intensity is None else float(max_intensity)
+
+    def sequence(self, name: str) -> FolderSequence:
+        """Open a folder of scans."""
+        folder = self._folder(name)
+        files = list_scans(folder, SUFFIXES)
+        if not len(files):
+            raise self._not_found(f"{name}: scans (.bin, .npy, .pcd or .ply)")
+        if len(kinds := _kinds(files)) > 1:
+            raise UserError(
+                f"{folder}: scans of several kinds ({', '.join(kinds)}).\n  change: keep one kind in a folder"
+            )
+        timestamps = _timestamps(folder, len(files))
+        poses = self._ground_truth(folder, len(files), timestamps)
+        scans = files.first(self.max_frames)
+        return FolderSequence(
+            name=name,
+            scans=scans,
+            T_world_lidar=None if poses is None else poses[: len(scans)],
+            timestamps=None if timestamps is None else timestamps[: len(scans)],
+            bin_columns=self.bin_columns,
+            max_intensity=self.max_intensity,
+            beam_correction_deg=self.beam_correction_deg,
+        )
+
+    def check(self) -> LayoutReport:
+        """Describe this folder by names and sizes."""
+        report = LayoutReport()
+        if layout.describe_root(report, self.root, _is_root, "scans and no folder of scans", _SOURCE):
+            there = {name: list_scans(self._folder(name), SUFFIXES) for name in find_sequences(self.root)}
+            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
+            for name in configured:
+                self._check_sequence(report, name)
+            layout.describe_unconfigured(report, there, configured)
+            layout.suggest_sequences(report, there)
+        return report
+
+    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+        folder = self._folder(name)
+        if not folder.is_dir():
+            report.missing(name, f"no folder {name}")
+            return
+        scans = list_scans(folder, SUFFIXES)
+        kinds = _kinds(scans)
+        layout.describe_scans(report, name, scans, 4 * self.bin_columns if kinds == [".bin"] else None)
+        if len(kinds) > 1:
+            report.missing(name, f"scans of several kinds: {', '.join(kinds)}")
+        if (folder / "times.txt").is_file():
+            layout.describe_rows(report, name, folder / "times.txt", "times", len(scans))
+        truth = self._ground_truth_file(folder)
+        if truth is None:
+            report.odd(name, "no ground truth: errors will not be defined, and the supervised loss cannot be used")
+        else:
+            report.found(name, f"ground truth in {truth} with {layout.count_rows(truth)} rows")
+
+    def _folder(self, name: str) -> Path:
+        folder = self.root / name
+        return self.root if name == self.root.absolute().name and not folder.is_dir() else folder
+
+    def _ground_truth_file(self, folder: Path) -> Path | None:
+        inside = [folder / name for name in _TRUTH_INSIDE]
+        beside = [folder.absolute().with_name(f"{folder.absolute().name}{suffix}") for suffix in (".txt", ".tum")]
+        return next((path for path in inside + beside if path.is_file()), None)
+
+    def _ground_truth(
+        self, folder: Path, count: int, timestamps: Float[Tensor, "n"] | None
+    ) -> Float[Tensor, "m 4 4"] | None:
+        path = self._ground_truth_file(folder)
+        if path is None:
+            return None
+        columns = len(path.read_text().partition("\n")[0].split())
+        T_world = read_kitti_poses(path) if columns == 12 else None
+        if T_world is None:
+            stamped = read_tum_poses(path)
+            T_world = stamped.T_world_body
+            if timestamps is not None:
+                T_world = _at(path, stamped.timestamps, T_world, timestamps)
+        if len(T_world) != count:
+            raise DamagedFileError(path, f"{len(T_world)} poses for {count} scans", "give every scan a row or a time")
+        return start_at_identity(T_world)
+
+    def _not_found(self, missing: str) -> DataSetNotFoundError:
+        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
+
+
+def find_sequences(root: Path) -> tuple[str, ...]:
+    """Names of the subfolders that hold scans; the folder's own name where it holds them itself; else nothing."""
+    names = tuple(folder.name for folder in subfolders(root) if holds_scans(folder, SUFFIXES))
+    return names or ((root.absolute().name,) if holds_scans(root, SUFFIXES) else ())
+
+
+def relative_times(times: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Times in any unit as shares of the sweep relative to its middle, within [-0.5, 0.5]; 0 where all are the same."""
+    first, last = times.min(), times.max()
+    period = torch.where(last > first, last - first, 1.0)
+    return ((times - (first + last) / 2) / period).float()
+
+
+def _at(
+    path: Path, times: Float[Tensor, "n"], T_world: Float[Tensor, "n 4 4"], scan_times: Float[Tensor, "m"]
+) -> Float[Tensor, "m 4 4"]:
+    """Poses at the scans' times; the nearest pose may be a tenth of a second beyond an end."""
+    if len(times) < 2 or scan_times.min() < times[0] - 0.1 or scan_times.max() > times[-1] + 0.1:
+        raise DamagedFileError(
+            path,
+            f"its times ({times[0]:.3f} to {times[-1]:.3f} s) do not cover those of the scans "
+            f"({scan_times.min():.3f} to {scan_times.max():.3f} s)",
+            "use one clock in both files",
+        )
+    return interpolate_poses(times, T_world, scan_times)
+
+
+def _timestamps(folder: Path, count: int) -> Float[Tensor, "n"] | None:
+    path = folder / "times.txt"
+    if not path.is_file():
+        return None
+    times = torch.from_numpy(read_numbers(path, columns=1)[:, 0])
+    if len(times) != count:
+        raise DamagedFileError(path, f"{len(times)} times for {count} scans", "give every scan a row")
+    return times
+
+
+def _kinds(scans: ScanFiles) -> list[str]:
+    return sorted({Path(name).suffix.lower() for name in scans.names})
+
+
+def _is_root(path: Path) -> bool:
+    return bool(find_sequences(path))

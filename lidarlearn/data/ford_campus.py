@@ -1,0 +1,243 @@
+"""Ford Campus: two drives around Dearborn, Michigan, with an HDL-64 on the roof of a pickup truck.
+
+On disk: `IJRR-Dataset-{1,2}/SCANS/Scan%04d.mat`, MATLAB files with a structure `SCAN`: `XYZ` (3 x n [m], the laser's
+frame with y forward and x right), `X_wv` (x, y, z [m], roll, pitch, heading [rad]: pose of the vehicle in the world)
+and `timestamp_laser` [us]. We turn points to x forward, y left: x' = y, y' = -x. Returns closer than 8 m are the truck
+itself. The poses sit inside the scans: reading them takes minutes, once, then they are kept beside the scans.
+
+The vehicle's frame is taken to have the axes of the turned points, as in the implementation by the authors of
+Dellenbach et al. 2021. `T_vehicle_lidar_m_deg` is there for whoever finds otherwise in his copy: the data set's
+PARAM.mat and paper place the laser at (2.4, -0.01, -2.3) m, (180, 0, 90) deg in a vehicle frame whose z points down,
+which for turned points reads [2.4, -0.01, -2.3, 180, 0, 0].
+"""
+
+import hashlib
+import logging
+import zipfile
+import zlib
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from rich.progress import track
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from lidarlearn.data import layout
+from lidarlearn.data.beam_correction import raise_beams
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.pose_files import as_transforms, start_at_identity
+from lidarlearn.data.scan_files import ScanFiles, list_scans, sequence_names, subfolders, warn_of_gaps
+from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.geometry.projection import SphericalProjection
+
+_log = logging.getLogger(__name__)
+
+_SOURCE = "http://robots.engin.umich.edu/SoftwareData/Ford (dataset-1 and dataset-2)"
+_POSES_FILE = "lidarlearn_poses.npz"
+_SMALLEST_BYTES = 1000  # of a file that holds a scan
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FordCampusSequence(Sequence):
+    """A drive of Ford Campus.
+
+    Args:
+        name: its folder.
+        scans: its files.
+        T_world_lidar: ground truth.
+        timestamps: of the scans [s].
+        min_range_m: returns closer than this are left out.
+        beam_correction_deg: angle by which every beam is raised.
+    """
+
+    name: str
+    scans: ScanFiles
+    T_world_lidar: Float[Tensor, "n 4 4"] | None
+    timestamps: Float[Tensor, "n"] | None
+    min_range_m: float
+    beam_correction_deg: float
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan; no times, it is motion compensated, and no intensities, the files hold none."""
+        path = self.scans.path(index)
+        laser = torch.from_numpy(_field(path, read_scan(path), "XYZ", rows=3).astype(np.float32))
+        points = torch.stack([laser[1], -laser[0], laser[2]], dim=1)
+        if not len(points):
+            raise DamagedFileError(path, "a scan without points")
+        if not points.isfinite().all():
+            raise DamagedFileError(path, "points that are not finite")
+        points = points[points.norm(dim=1) >= self.min_range_m]
+        return Scan(raise_beams(points, self.beam_correction_deg))
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the files, the beam correction and the minimum range."""
+        return self.scans.fingerprint(
+            "FordCampus", beam_correction_deg=self.beam_correction_deg, min_range_m=self.min_range_m
+        )
+
+
+class FordCampus(DataSet):
+    """Ford Campus.
+
+    Args:
+        root: the folder that holds IJRR-Dataset-1 and IJRR-Dataset-2.
+        projection: the image of the HDL-64.
+        train_sequences: IJRR-Dataset-1 or IJRR-Dataset-2.
+        val_sequences: likewise.
+        test_sequences: likewise.
+        max_frames: keep only the first scans of each sequence; None keeps all.
+        deskew: must be false, the scans are compensated already.
+        beam_correction_deg: angle by which every beam is raised.
+        min_range_m: returns closer than this are the truck itself.
+        T_vehicle_lidar_m_deg: pose of the (turned) laser in the vehicle: x, y, z [m], roll, pitch, yaw [deg].
+    """
+
+    title = "Ford Campus"
+
+    def __init__(
+        self,
+        root: str | Path,
+        projection: SphericalProjection,
+        train_sequences: Iterable[str | int],
+        val_sequences: Iterable[str | int],
+        test_sequences: Iterable[str | int],
+        max_frames: int | None = None,
+        deskew: bool = False,
+        beam_correction_deg: float | int = 0.0,
+        min_range_m: float | int = 8.0,
+        T_vehicle_lidar_m_deg: Iterable[float | int] = (0, 0, 0, 0, 0, 0),
+    ) -> None:
+        self.root = Path(root)
+        self.projection = projection
+        self.train_sequences = sequence_names(train_sequences)
+        self.val_sequences = sequence_names(val_sequences)
+        self.test_sequences = sequence_names(test_sequences)
+        self.max_frames = max_frames
+        self.deskew = deskew
+        self.beam_correction_deg = float(beam_correction_deg)
+        self.min_range_m = float(min_range_m)
+        self.T_vehicle_lidar = _from_degrees(np.array([list(T_vehicle_lidar_m_deg)], dtype=np.float64))[0]
+
+    def sequence(self, name: str) -> FordCampusSequence:
+        """Open a drive; the first time this reads every scan for its pose."""
+        layout.refuse_deskew(self.title, self.deskew)
+        scans = list_scans(self.root / name / "SCANS", (".mat",)).first(self.max_frames)
+        if not len(scans):
+            raise self._not_found(f"{name}/SCANS/Scan*.mat")
+        warn_of_gaps(name, scans)
+        stamped = read_poses(name, scans)
+        T_world_vehicle = _from_degrees(np.concatenate([stamped[:, 1:4], np.degrees(stamped[:, 4:])], axis=1))
+        return FordCampusSequence(
+            name=name,
+            scans=scans,
+            T_world_lidar=start_at_identity(T_world_vehicle @ self.T_vehicle_lidar),
+            timestamps=torch.from_numpy(stamped[:, 0] * 1e-6),
+            min_range_m=self.min_range_m,
+            beam_correction_deg=self.beam_correction_deg,
+        )
+
+    def check(self) -> LayoutReport:
+        """Describe this copy by names and sizes."""
+        report = LayoutReport()
+        if layout.describe_root(report, self.root, _is_root, "folder like IJRR-Dataset-1 with SCANS in it", _SOURCE):
+            drives = [folder for folder in subfolders(self.root) if (folder / "SCANS").is_dir()]
+            there = {folder.name: list_scans(folder / "SCANS", (".mat",)) for folder in drives}
+            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
+            for name in configured:
+                self._check_sequence(report, name)
+            layout.describe_unconfigured(report, there, configured)
+            layout.suggest_sequences(report, there)
+        return report
+
+    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+        if not (self.root / name).is_dir():
+            report.missing(name, f"no folder {name}")
+            return
+        scans = list_scans(self.root / name / "SCANS", (".mat",))
+        layout.describe_scans(report, name, scans, bytes_per_point=None, smallest_bytes=_SMALLEST_BYTES)
+
+    def _not_found(self, missing: str) -> DataSetNotFoundError:
+        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
+
+
+def read_scan(path: Path) -> np.void:
+    """The structure `SCAN` of a file.
+
+    Raises:
+        DamagedFileError: no MATLAB file, truncated, or without it.
+    """
+    try:
+        return loadmat(path, variable_names=["SCAN"])["SCAN"][0, 0]
+    except (OSError, MatReadError, ValueError, TypeError, zlib.error, KeyError, IndexError) as error:
+        raise DamagedFileError(path, f"no MATLAB file with a structure SCAN ({error})") from error
+
+
+def read_poses(name: str, scans: ScanFiles) -> NDArray[np.float64]:
+    """Time [us], position [m], roll, pitch and heading [rad] of every scan (n, 7), kept in a file beside the scans.
+
+    Raises:
+        DamagedFileError: a scan cannot be read or its pose is not finite.
+    """
+    kept = scans.folder.parent / _POSES_FILE
+    key = hashlib.sha256(repr((scans.names, scans.sizes)).encode()).hexdigest()
+    if (stamped := _kept_poses(kept, key)) is not None:
+        return stamped
+    with ThreadPoolExecutor() as pool:  # inflating the files runs beside python
+        rows = pool.map(_read_pose, (scans.path(i) for i in range(len(scans))))
+        stamped = np.stack(list(track(rows, f"poses of {name}", total=len(scans), transient=True)))
+    try:
+        np.savez(kept, key=key, stamped=stamped)
+    except OSError as error:
+        _log.info("poses are not kept for the next time: %s", error)
+    return stamped
+
+
+def _kept_poses(path: Path, key: str) -> NDArray[np.float64] | None:
+    try:
+        with np.load(path) as file:
+            return file["stamped"] if str(file["key"]) == key else None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _read_pose(path: Path) -> NDArray[np.float64]:
+    scan = read_scan(path)
+    stamp = _field(path, scan, "timestamp_laser", rows=1).astype(np.float64)
+    row = np.concatenate([stamp.reshape(1), _field(path, scan, "X_wv", rows=6).astype(np.float64).reshape(6)])
+    if not np.isfinite(row).all():
+        raise DamagedFileError(path, "a pose X_wv that is not finite")
+    return row
+
+
+def _field(path: Path, scan: np.void, name: str, rows: int) -> NDArray[Any]:
+    """A field of `SCAN` of shape (rows, n)."""
+    names = scan.dtype.names or ()
+    if name not in names:
+        raise DamagedFileError(path, f"SCAN has no field {name}, only {', '.join(names)}")
+    values = scan[name]
+    if values.ndim != 2 or values.shape[0] != rows:
+        raise DamagedFileError(path, f"SCAN.{name} is {values.shape}, not ({rows}, n)")
+    return values
+
+
+def _from_degrees(poses: NDArray[np.float64]) -> Float[Tensor, "n 4 4"]:
+    """Transforms of x, y, z [m], roll, pitch, yaw [deg] with R = Rz Ry Rx."""
+    R = Rotation.from_euler("ZYX", poses[:, [5, 4, 3]], degrees=True).as_matrix()
+    return as_transforms(torch.from_numpy(np.concatenate([R, poses[:, :3, None]], axis=2)))
+
+
+def _is_root(path: Path) -> bool:
+    return any((folder / "SCANS").is_dir() for folder in subfolders(path))

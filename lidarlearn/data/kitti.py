@@ -1,0 +1,195 @@
+"""KITTI odometry: 22 drives with an HDL-64, motion compensated; ground truth for the first eleven.
+
+On disk: `sequences/NN/{velodyne/%06d.bin, calib.txt, times.txt}` and `poses/NN.txt`. Scans are float32 x, y, z,
+reflectance in the LiDAR's frame. Poses are those of the left camera; `Tr` in calib.txt is T_camera_lidar. A scan's
+number selects its row of poses and times, so a copy may hold any part of the scans.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.data import layout
+from lidarlearn.data.beam_correction import raise_beams
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.pose_files import as_transforms, read_kitti_poses, read_numbers, start_at_identity
+from lidarlearn.data.scan_files import (
+    ScanFiles,
+    list_scans,
+    read_float32_rows,
+    sequence_names,
+    subfolders,
+    warn_of_gaps,
+)
+from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.geometry.projection import SphericalProjection
+
+_SOURCE = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php (velodyne, calibration, ground truth poses)"
+_WITH_GROUND_TRUTH = tuple(f"{i:02d}" for i in range(11))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class KittiOdometrySequence(Sequence):
+    """A drive of KITTI odometry.
+
+    Args:
+        name: two digits.
+        scans: its files.
+        T_world_lidar: ground truth, None from 11 on.
+        timestamps: from times.txt [s].
+        T_reference_lidar: `Tr`, to the left camera.
+        beam_correction_deg: angle by which every beam is raised.
+    """
+
+    name: str
+    scans: ScanFiles
+    T_world_lidar: Float[Tensor, "n 4 4"] | None
+    timestamps: Float[Tensor, "n"] | None
+    T_reference_lidar: Float[Tensor, "4 4"]
+    beam_correction_deg: float
+    reference_frame: str = "camera"
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan; no times, it is motion compensated."""
+        rows = read_float32_rows(self.scans.path(index), columns=4)
+        return Scan(raise_beams(rows[:, :3], self.beam_correction_deg), intensities=rows[:, 3].clamp(0, 1))
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the files and the beam correction."""
+        return self.scans.fingerprint("KittiOdometry", beam_correction_deg=self.beam_correction_deg)
+
+
+class KittiOdometry(DataSet):
+    """KITTI odometry.
+
+    Args:
+        root: the folder that holds `sequences` and `poses`.
+        projection: the image of the HDL-64.
+        train_sequences: two digits each.
+        val_sequences: two digits each.
+        test_sequences: two digits each.
+        max_frames: keep only the first scans of each sequence; None keeps all.
+        deskew: must be false, the scans are compensated already.
+        beam_correction_deg: angle by which every beam is raised, 0 for scans as published.
+    """
+
+    title = "KITTI odometry"
+
+    def __init__(
+        self,
+        root: str | Path,
+        projection: SphericalProjection,
+        train_sequences: Iterable[str | int],
+        val_sequences: Iterable[str | int],
+        test_sequences: Iterable[str | int],
+        max_frames: int | None = None,
+        deskew: bool = False,
+        beam_correction_deg: float | int = 0.205,
+    ) -> None:
+        self.root = Path(root)
+        self.projection = projection
+        self.train_sequences = sequence_names(train_sequences, digits=2)
+        self.val_sequences = sequence_names(val_sequences, digits=2)
+        self.test_sequences = sequence_names(test_sequences, digits=2)
+        self.max_frames = max_frames
+        self.deskew = deskew
+        self.beam_correction_deg = float(beam_correction_deg)
+
+    def sequence(self, name: str) -> KittiOdometrySequence:
+        """Open a sequence."""
+        layout.refuse_deskew(self.title, self.deskew)
+        folder = self.root / "sequences" / name
+        scans = list_scans(folder / "velodyne", (".bin",)).first(self.max_frames)
+        if not len(scans):
+            raise self._not_found(f"sequences/{name}/velodyne/*.bin")
+        if not (folder / "calib.txt").is_file():
+            raise self._not_found(f"sequences/{name}/calib.txt")
+        warn_of_gaps(name, scans)
+        T_camera_lidar = read_velodyne_calibration(folder / "calib.txt")
+        return KittiOdometrySequence(
+            name=name,
+            scans=scans,
+            T_world_lidar=self._ground_truth(name, scans, T_camera_lidar),
+            timestamps=self._timestamps(folder / "times.txt", scans),
+            T_reference_lidar=T_camera_lidar,
+            beam_correction_deg=self.beam_correction_deg,
+        )
+
+    def check(self) -> LayoutReport:
+        """Describe this copy by names, sizes and the lengths of text files."""
+        report = LayoutReport()
+        if layout.describe_root(report, self.root, _is_root, "folder 'sequences'", _SOURCE):
+            there = {f.name: list_scans(f / "velodyne", (".bin",)) for f in subfolders(self.root / "sequences")}
+            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
+            for name in configured:
+                self._check_sequence(report, name)
+            layout.describe_unconfigured(report, there, configured)
+            layout.suggest_sequences(report, there)
+        return report
+
+    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+        folder = self.root / "sequences" / name
+        if not folder.is_dir():
+            report.missing(name, f"no folder sequences/{name}")
+            return
+        scans = list_scans(folder / "velodyne", (".bin",))
+        layout.describe_scans(report, name, scans, bytes_per_point=16)
+        if not (folder / "calib.txt").is_file():
+            report.missing(name, "no calib.txt")
+        rows_needed = max(scans.numbers, default=-1) + 1
+        layout.describe_rows(report, name, folder / "times.txt", "times", rows_needed)
+        if name in _WITH_GROUND_TRUTH:
+            poses = self.root / "poses" / f"{name}.txt"
+            layout.describe_rows(report, name, poses, "poses", rows_needed, needed=name in self.test_sequences)
+
+    def _ground_truth(
+        self, name: str, scans: ScanFiles, T_camera_lidar: Float[Tensor, "4 4"]
+    ) -> Float[Tensor, "n 4 4"] | None:
+        path = self.root / "poses" / f"{name}.txt"
+        if not path.is_file():
+            return None
+        T_world_camera = read_kitti_poses(path)
+        _require_rows(path, len(T_world_camera), scans)
+        return start_at_identity(T_world_camera[scans.numbers] @ T_camera_lidar)
+
+    def _timestamps(self, path: Path, scans: ScanFiles) -> Float[Tensor, "n"] | None:
+        if not path.is_file():
+            return None
+        times = torch.from_numpy(read_numbers(path, columns=1)[:, 0])
+        _require_rows(path, len(times), scans)
+        return times[scans.numbers]
+
+    def _not_found(self, missing: str) -> DataSetNotFoundError:
+        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
+
+
+def read_velodyne_calibration(path: Path) -> Float[Tensor, "4 4"]:
+    """`Tr` of a KITTI odometry calib.txt: T_camera_lidar, to the left camera.
+
+    Raises:
+        DamagedFileError: no such line, or not twelve numbers.
+    """
+    lines = [line.partition(":")[2] for line in path.read_text().splitlines() if line.startswith("Tr:")]
+    try:
+        numbers = torch.tensor([float(value) for value in lines[0].split()], dtype=torch.float64)
+        return as_transforms(numbers.reshape(3, 4))
+    except (IndexError, ValueError, RuntimeError) as error:
+        raise DamagedFileError(path, "no line 'Tr:' with twelve numbers") from error
+
+
+def _require_rows(path: Path, rows: int, scans: ScanFiles) -> None:
+    if rows <= max(scans.numbers):
+        last = scans.names[max(range(len(scans)), key=scans.numbers.__getitem__)]
+        raise DamagedFileError(path, f"{rows} rows, too few for scan {last} in {scans.folder}")
+
+
+def _is_root(path: Path) -> bool:
+    return (path / "sequences").is_dir()

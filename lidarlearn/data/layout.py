@@ -1,0 +1,168 @@
+"""What all layout checks have in common: describing files by names and sizes, and finding the right folder level."""
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from lidarlearn.data.errors import DataSetNotFoundError
+from lidarlearn.data.scan_files import ScanFiles, gaps, subfolders
+from lidarlearn.data.sequence import LayoutReport
+from lidarlearn.errors import UserError
+
+_SHOWN = 5  # so many examples are listed before "..."
+
+
+def find_root(root: Path, is_root: Callable[[Path], bool]) -> Path | None:
+    """The folder near `root` that looks like the root of a data set: the given one, up to two below, or two above.
+
+    None where there is no such folder, or where `root` itself is not there: its surroundings say nothing then.
+    """
+    if not root.is_dir():
+        return None
+    below = subfolders(root)
+    grandchildren = (path for folder in below for path in subfolders(folder))
+    candidates = itertools.chain([root], below, grandchildren, list(root.absolute().parents)[:2])
+    return next((path for path in candidates if is_root(path)), None)
+
+
+def describe_root(report: LayoutReport, root: Path, is_root: Callable[[Path], bool], marker: str, source: str) -> bool:
+    """Note whether the root is at the right level, and where the right one seems to be.
+
+    Args:
+        report: what is added to.
+        root: as configured.
+        is_root: recognises the right level.
+        marker: what the right level holds, for the reader.
+        source: where the data comes from.
+
+    Returns:
+        whether a look below makes sense.
+    """
+    if is_root(root):
+        report.found("root", str(root))
+        return True
+    near = find_root(root, is_root)
+    if near is not None:
+        report.missing("root", f"wrong folder level: {root} holds no {marker}, but {near} does")
+        report.remedy = f"data.root={near}"
+    else:
+        report.missing("root", f"{root} holds no {marker}" if root.is_dir() else f"{root}: no such folder")
+        report.remedy = (
+            f"data.root=/path/to/your/copy, or the environment variable LIDARLEARN_DATA; get the data from {source}"
+        )
+    return False
+
+
+def describe_scans(
+    report: LayoutReport,
+    name: str,
+    scans: ScanFiles,
+    bytes_per_point: int | None,
+    numbered: bool = True,
+    smallest_bytes: int = 1,
+) -> None:
+    """Note how many scans there are, holes in their numbering, and files that cannot be whole.
+
+    Args:
+        report: what is added to.
+        name: of the sequence.
+        scans: its files.
+        bytes_per_point: of which every size must be a multiple; None where it is not fixed.
+        numbered: whether the names count the scans, rather than giving the time or nothing.
+        smallest_bytes: below which a file cannot hold a scan.
+    """
+    if not len(scans):
+        report.missing(name, f"no scans in {scans.folder}")
+        return
+    report.found(name, f"{len(scans)} scans, {scans.names[0]} to {scans.names[-1]}")
+    sizes = np.array(scans.sizes)
+    broken = (sizes < smallest_bytes) | (sizes % (bytes_per_point or 1) != 0)
+    if broken.any():
+        report.missing(name, f"{broken.sum()} empty or truncated files: {_files(scans, broken)}")
+    small = ~broken & (sizes < np.median(sizes) / 4)
+    if small.any():
+        report.odd(name, f"{small.sum()} files less than a quarter of the usual size: {_files(scans, small)}")
+    if numbered and (holes := gaps(scans.numbers)):
+        shown = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in holes[:_SHOWN])
+        report.odd(name, f"{len(holes)} gaps in the numbering: {shown}{', ...' if len(holes) > _SHOWN else ''}")
+
+
+def describe_rows(
+    report: LayoutReport, name: str, path: Path, what: str, rows_needed: int, needed: bool = False
+) -> None:
+    """Note a text file whose rows the numbers of the scans select.
+
+    Args:
+        report: what is added to.
+        name: of the sequence.
+        path: of the file.
+        what: its rows, in the plural.
+        rows_needed: one more than the greatest number of a scan.
+        needed: whether the data cannot be used without it.
+    """
+    if not path.is_file():
+        (report.missing if needed else report.odd)(name, f"no {what}: {path} not found")
+        return
+    rows = count_rows(path)
+    if rows < rows_needed:
+        report.missing(name, f"{rows} {what} in {path.name}, fewer than the {rows_needed} that the scans need")
+    elif rows > rows_needed:
+        report.found(name, f"{rows} {what}, of which the scans need the first {rows_needed} (a partial copy)")
+    else:
+        report.found(name, f"{rows} {what}")
+
+
+def count_rows(path: Path) -> int:
+    """Number of lines of a text file, blank ones at the end left out: blank ones within stand for dropped frames."""
+    with path.open("rb") as file:
+        return max((number for number, line in enumerate(file, start=1) if line.strip()), default=0)
+
+
+def not_found(
+    title: str, missing: str, root: Path, is_root: Callable[[Path], bool], source: str
+) -> DataSetNotFoundError:
+    """The error for what is not there, with the right root where one lies near the configured one.
+
+    Args:
+        title: of the data set.
+        missing: what was not found.
+        root: as configured.
+        is_root: recognises the right level.
+        source: where the data comes from.
+    """
+    near = None if is_root(root) else find_root(root, is_root)
+    hint = "" if near is None else f"wrong folder level, data.root={near} looks right; "
+    return DataSetNotFoundError(title, hint + missing, root, source)
+
+
+def refuse_deskew(title: str, deskew: bool) -> None:
+    """Raise UserError where scans without point times are to be deskewed: that would only make them worse."""
+    if deskew:
+        raise UserError(f"{title}: its scans are motion compensated already.\n  change: data.deskew=false")
+
+
+def describe_unconfigured(report: LayoutReport, found: Mapping[str, ScanFiles], configured: Iterable[str]) -> None:
+    """Note the sequences that are there but that no setting names."""
+    named = set(configured)
+    for name, scans in found.items():
+        if name not in named:
+            report.found(name, f"{len(scans)} scans, but it is not among the configured sequences")
+
+
+def suggest_sequences(report: LayoutReport, found: Iterable[str]) -> None:
+    """Fill in what to change where some of the configured sequences cannot be used."""
+    if report.usable or report.remedy:
+        return
+    there = ",".join(found)
+    report.remedy = (
+        "complete what is missing, or name only sequences that are there"
+        f" ({there or 'none'}) in data.train_sequences, data.val_sequences and data.test_sequences"
+    )
+
+
+def _files(scans: ScanFiles, chosen: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> str:
+    indices = np.flatnonzero(chosen)
+    shown = ", ".join(f"{scans.names[i]} ({scans.sizes[i]} bytes)" for i in indices[:_SHOWN])
+    return shown + (", ..." if len(indices) > _SHOWN else "")

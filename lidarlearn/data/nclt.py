@@ -1,0 +1,222 @@
+"""NCLT: a Segway on the University of Michigan's North Campus, 27 drives in all seasons, with an HDL-32.
+
+On disk: `DATE/velodyne_sync/<utime>.bin` and `groundtruth_DATE.csv`, either inside DATE or in `ground_truth` beside the
+dates. A scan's name is its time [us]. A point takes 8 bytes: x, y, z as *unsigned* 16 bit (value * 0.005 - 100 m; read
+as signed, everything beyond +63.84 m wraps), intensity and laser as 8 bit. Scans are motion compensated.
+
+The files' frame is the Segway's: x forward, y right, z down, its origin `sensor_height_m` below the laser, which hangs
+upside down and so sees from -10.67 to +30.67 deg. We move scans into the laser's own centre, x forward, y left, z up,
+as a spherical projection needs: there, and only there, every beam has the constant elevation of the data sheet.
+Ground truth is the Segway's pose at about 100 Hz: utime, x, y, z, roll, pitch, heading; rows with NaN stand for no fix.
+"""
+
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from lidarlearn.data import layout
+from lidarlearn.data.beam_correction import raise_beams
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.interpolation import interpolate_poses
+from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, start_at_identity
+from lidarlearn.data.scan_files import ScanFiles, list_scans, read_bytes, sequence_names, subfolders
+from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.geometry.projection import SphericalProjection
+
+_log = logging.getLogger(__name__)
+
+_SOURCE = "http://robots.engin.umich.edu/nclt/ (velodyne and ground truth of each date)"
+POINT = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
+SCALE_M = 0.005
+OFFSET_M = -100.0
+# From the files' axes (x forward, y right, z down) to ours (x forward, y left, z up).
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+_LONGEST_GAP_S = 1.0  # between two rows of ground truth, before scans in between are reported
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NcltSequence(Sequence):
+    """A drive of NCLT.
+
+    Args:
+        name: its date.
+        scans: its files.
+        T_world_lidar: ground truth at the times of the scans; None where there is none.
+        timestamps: from the files' names [s].
+        beam_correction_deg: angle by which every beam is raised.
+        sensor_height_m: of the laser above the origin of the files' frame.
+    """
+
+    name: str
+    scans: ScanFiles
+    T_world_lidar: Float[Tensor, "n 4 4"] | None
+    timestamps: Float[Tensor, "n"] | None
+    beam_correction_deg: float
+    sensor_height_m: float
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan; no times, it is motion compensated."""
+        data = np.frombuffer(read_bytes(self.scans.path(index), POINT.itemsize), POINT)
+        xyz = torch.from_numpy(data["xyz"].astype(np.float32)) * SCALE_M + OFFSET_M
+        points = xyz * torch.tensor([1.0, -1.0, -1.0]) - torch.tensor([0.0, 0.0, self.sensor_height_m])
+        points = raise_beams(points, self.beam_correction_deg)
+        return Scan(points, intensities=torch.from_numpy(data["intensity"].astype(np.float32)) / 255)
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the files, the beam correction and the height of the sensor."""
+        return self.scans.fingerprint(
+            "Nclt", beam_correction_deg=self.beam_correction_deg, sensor_height_m=self.sensor_height_m
+        )
+
+
+class Nclt(DataSet):
+    """NCLT.
+
+    Args:
+        root: the folder that holds the dates.
+        projection: the image of the HDL-32 upside down.
+        train_sequences: dates, e.g. 2012-01-22.
+        val_sequences: dates.
+        test_sequences: dates.
+        max_frames: keep only the first scans of each sequence; None keeps all.
+        deskew: must be false, the scans are compensated already.
+        beam_correction_deg: angle by which every beam is raised.
+        sensor_height_m: of the laser above the origin of the files' frame.
+    """
+
+    title = "NCLT"
+
+    def __init__(
+        self,
+        root: str | Path,
+        projection: SphericalProjection,
+        train_sequences: Iterable[str | int],
+        val_sequences: Iterable[str | int],
+        test_sequences: Iterable[str | int],
+        max_frames: int | None = None,
+        deskew: bool = False,
+        beam_correction_deg: float | int = 0.0,
+        sensor_height_m: float | int = 1.03,
+    ) -> None:
+        self.root = Path(root)
+        self.projection = projection
+        self.train_sequences = sequence_names(train_sequences)
+        self.val_sequences = sequence_names(val_sequences)
+        self.test_sequences = sequence_names(test_sequences)
+        self.max_frames = max_frames
+        self.deskew = deskew
+        self.beam_correction_deg = float(beam_correction_deg)
+        self.sensor_height_m = float(sensor_height_m)
+
+    def sequence(self, name: str) -> NcltSequence:
+        """Open a drive; scans before and after its ground truth are left out."""
+        layout.refuse_deskew(self.title, self.deskew)
+        scans = list_scans(self.root / name / "velodyne_sync", (".bin",))
+        if not len(scans):
+            raise self._not_found(f"{name}/velodyne_sync/*.bin")
+        ground_truth = self._ground_truth_file(name)
+        truth = None if ground_truth is None else read_ground_truth(ground_truth)
+        scans = (scans if truth is None else _covered(name, scans, truth)).first(self.max_frames)
+        if ground_truth is not None and not len(scans):
+            raise DamagedFileError(ground_truth, f"its times do not overlap with those of the scans of {name}")
+        timestamps = _timestamps(scans)
+        return NcltSequence(
+            name=name,
+            scans=scans,
+            T_world_lidar=None if truth is None else self._poses(truth, timestamps),
+            timestamps=timestamps,
+            beam_correction_deg=self.beam_correction_deg,
+            sensor_height_m=self.sensor_height_m,
+        )
+
+    def check(self) -> LayoutReport:
+        """Describe this copy by names and sizes."""
+        report = LayoutReport()
+        if layout.describe_root(report, self.root, _is_root, "folder of a date with velodyne_sync in it", _SOURCE):
+            days = [folder for folder in subfolders(self.root) if (folder / "velodyne_sync").is_dir()]
+            there = {folder.name: list_scans(folder / "velodyne_sync", (".bin",)) for folder in days}
+            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
+            for name in configured:
+                self._check_sequence(report, name)
+            layout.describe_unconfigured(report, there, configured)
+            layout.suggest_sequences(report, there)
+        return report
+
+    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+        if not (self.root / name).is_dir():
+            report.missing(name, f"no folder {name}")
+            return
+        scans = list_scans(self.root / name / "velodyne_sync", (".bin",))
+        layout.describe_scans(report, name, scans, POINT.itemsize, numbered=False)
+        note = report.missing if name in self.test_sequences else report.odd
+        ground_truth = self._ground_truth_file(name)
+        if ground_truth is None:
+            note(name, f"no ground truth: no groundtruth_{name}.csv in {name} or ground_truth")
+        elif ground_truth.stat().st_size == 0:
+            report.missing(name, f"empty ground truth: {ground_truth}")
+        else:
+            report.found(name, f"ground truth in {ground_truth.relative_to(self.root)}")
+
+    def _ground_truth_file(self, name: str) -> Path | None:
+        candidates = (folder / f"groundtruth_{name}.csv" for folder in (self.root / name, self.root / "ground_truth"))
+        return next((path for path in candidates if path.is_file()), None)
+
+    def _poses(self, truth: StampedPoses, timestamps: Float[Tensor, "n"]) -> Float[Tensor, "n 4 4"]:
+        T_files_lidar = FLIP.clone()
+        T_files_lidar[2, 3] = -self.sensor_height_m
+        T_world_files = interpolate_poses(truth.timestamps, truth.T_world_body, timestamps)
+        return start_at_identity(T_world_files @ T_files_lidar)
+
+    def _not_found(self, missing: str) -> DataSetNotFoundError:
+        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
+
+
+def read_ground_truth(path: Path) -> StampedPoses:
+    """The Segway's poses, z down, from `utime, x, y, z, roll, pitch, heading` [us, m, rad]; rows with NaN are dropped.
+
+    Raises:
+        DamagedFileError: not such a file, fewer than two usable rows, or times that do not ascend.
+    """
+    rows = read_numbers(path, columns=7, delimiter=",")
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if len(rows) < 2:
+        raise DamagedFileError(path, f"{len(rows)} rows without NaN")
+    if (np.diff(rows[:, 0]) <= 0).any():
+        raise DamagedFileError(path, "time stamps that do not ascend")
+    R = Rotation.from_euler("ZYX", rows[:, [6, 5, 4]]).as_matrix()
+    T = as_transforms(torch.from_numpy(np.concatenate([R, rows[:, 1:4, None]], axis=2)))
+    return StampedPoses(torch.from_numpy(rows[:, 0] * 1e-6), T)
+
+
+def _covered(name: str, scans: ScanFiles, truth: StampedPoses) -> ScanFiles:
+    """The scans within the time of the ground truth; says how many are not, or lie in a hole of it."""
+    times = _timestamps(scans)
+    inside = (times >= truth.timestamps[0]) & (times <= truth.timestamps[-1])
+    if not inside.all():
+        _log.warning("%s: %d scans before or after the ground truth are left out", name, int((~inside).sum()))
+    after = torch.searchsorted(truth.timestamps, times).clamp(1, len(truth.timestamps) - 1)
+    in_hole = inside & (truth.timestamps[after] - truth.timestamps[after - 1] > _LONGEST_GAP_S)
+    if in_hole.any():
+        _log.warning(
+            "%s: %d scans lie in holes of the ground truth longer than %g s", name, int(in_hole.sum()), _LONGEST_GAP_S
+        )
+    return scans.select(np.flatnonzero(inside.numpy()).tolist())
+
+
+def _timestamps(scans: ScanFiles) -> Float[Tensor, "n"]:
+    return torch.tensor(scans.numbers, dtype=torch.float64) * 1e-6
+
+
+def _is_root(path: Path) -> bool:
+    return any((date / "velodyne_sync").is_dir() for date in subfolders(path))

@@ -1,0 +1,99 @@
+"""Ground truth and calibration as text: rows of numbers, KITTI's 3x4 poses, TUM's stamped quaternions."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from lidarlearn.data.errors import DamagedFileError
+
+
+@dataclass(frozen=True)
+class StampedPoses:
+    """Poses with the time of each.
+
+    Args:
+        timestamps: [s], ascending.
+        T_world_body: 4x4 matrices.
+    """
+
+    timestamps: Float[Tensor, "n"]
+    T_world_body: Float[Tensor, "n 4 4"]
+
+
+def read_numbers(path: Path, columns: int, delimiter: str | None = None) -> NDArray[np.float64]:
+    """A text file of rows of numbers, `#` begins a comment; NaN is left to the caller.
+
+    Raises:
+        DamagedFileError: absent, empty, not numbers, or another number of columns.
+    """
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DamagedFileError(path, f"cannot be read: {error}") from error
+    lines = [line for line in text.splitlines() if line.split("#")[0].strip()]
+    if not lines:
+        raise DamagedFileError(path, "the file is empty")
+    try:
+        rows = np.loadtxt(lines, dtype=np.float64, delimiter=delimiter, ndmin=2)
+    except ValueError as error:
+        raise DamagedFileError(path, f"not a table of numbers: {str(error).split(';')[0]}") from error
+    if rows.shape[1] != columns:
+        raise DamagedFileError(path, f"{rows.shape[1]} numbers in a row where {columns} are expected")
+    return rows
+
+
+def require_finite(path: Path, rows: NDArray[np.float64]) -> None:
+    """Raise DamagedFileError with the number of the first row that is not finite."""
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(bad):
+        raise DamagedFileError(path, f"{len(bad)} rows are not finite, the first is row {bad[0] + 1}")
+
+
+def read_kitti_poses(path: Path) -> Float[Tensor, "n 4 4"]:
+    """Poses written as the twelve numbers of a 3x4 matrix in row-major order, exactly as they stand.
+
+    Raises:
+        DamagedFileError: not such a file.
+    """
+    rows = read_numbers(path, columns=12)
+    require_finite(path, rows)
+    return as_transforms(torch.from_numpy(rows).reshape(-1, 3, 4))
+
+
+def read_tum_poses(path: Path) -> StampedPoses:
+    """Poses written as `timestamp tx ty tz qx qy qz qw` [s, m].
+
+    Raises:
+        DamagedFileError: not such a file, a quaternion of length zero, or times that do not ascend.
+    """
+    rows = read_numbers(path, columns=8)
+    require_finite(path, rows)
+    if (np.linalg.norm(rows[:, 4:], axis=1) < 0.5).any():
+        raise DamagedFileError(path, "a quaternion that is not of length 1")
+    if (np.diff(rows[:, 0]) <= 0).any():
+        raise DamagedFileError(path, "time stamps that do not ascend")
+    T = as_transforms(torch.from_numpy(np.dstack([Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4, None]])))
+    return StampedPoses(torch.from_numpy(rows[:, 0].copy()), T)
+
+
+def as_transforms(top: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """4x4 matrices from their upper three rows."""
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1
+    return torch.cat([top, bottom], dim=-2)
+
+
+def start_at_identity(T_world: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
+    """The same motion with the first pose as the world frame.
+
+    The inverse is a general one: published rotations are orthonormal only to the digits printed.
+    """
+    T = torch.linalg.inv(T_world[0]) @ T_world
+    T[0] = torch.eye(4, dtype=T.dtype)
+    return T

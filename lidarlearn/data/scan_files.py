@@ -1,0 +1,159 @@
+"""Folders of scan files: what they hold, judged by names and sizes alone, and the plain binary ones read."""
+
+import hashlib
+import itertools
+import logging
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.data.errors import DamagedFileError
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ScanFiles:
+    """The scan files of one folder in the order of time.
+
+    Args:
+        folder: where they are.
+        names: file names, in natural order: 9 before 10.
+        sizes: of each file [bytes].
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    sizes: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def path(self, index: int) -> Path:
+        """Path of one scan."""
+        return self.folder / self.names[index]
+
+    @property
+    def numbers(self) -> list[int]:
+        """The last number in each file's name: what data sets count their scans by; -1 where there is none."""
+        return [int(found[-1]) if (found := re.findall(r"\d+", Path(name).stem)) else -1 for name in self.names]
+
+    def select(self, indices: Iterable[int]) -> "ScanFiles":
+        """Only some of the files, in the order given."""
+        chosen = list(indices)
+        return ScanFiles(self.folder, tuple(self.names[i] for i in chosen), tuple(self.sizes[i] for i in chosen))
+
+    def first(self, count: int | None) -> "ScanFiles":
+        """The first `count` files; all of them for None."""
+        return ScanFiles(self.folder, self.names[:count], self.sizes[:count])
+
+    def fingerprint(self, reader: str, **settings: Any) -> str:
+        """Digest of the reader, its settings and the files' names and sizes, wherever the folder lies."""
+        parts = (reader, sorted(settings.items()), self.names, self.sizes)
+        return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def list_scans(folder: Path, suffixes: tuple[str, ...]) -> ScanFiles:
+    """The files of a folder with one of the suffixes, hidden ones left out; none where the folder is absent.
+
+    Only names and sizes are looked at, which takes a tenth of a second for 20,000 files.
+    """
+    if not folder.is_dir():
+        return ScanFiles(folder, (), ())
+    with os.scandir(folder) as entries:
+        found = [(e.name, e.stat().st_size) for e in entries if _is_scan(e, suffixes)]
+    found.sort(key=lambda file: natural_key(file[0]))
+    return ScanFiles(folder, tuple(name for name, _ in found), tuple(size for _, size in found))
+
+
+def holds_scans(folder: Path, suffixes: tuple[str, ...]) -> bool:
+    """Whether a folder has at least one file with one of the suffixes directly in it."""
+    if not folder.is_dir():
+        return False
+    with os.scandir(folder) as entries:
+        return any(_is_scan(entry, suffixes) for entry in entries)
+
+
+def _is_scan(entry: "os.DirEntry[str]", suffixes: tuple[str, ...]) -> bool:
+    return entry.name.lower().endswith(suffixes) and not entry.name.startswith(".") and entry.is_file()
+
+
+def subfolders(folder: Path) -> list[Path]:
+    """The folders directly below one, hidden ones left out, in natural order; none where it is absent."""
+    if not folder.is_dir():
+        return []
+    with os.scandir(folder) as entries:
+        found = [Path(e.path) for e in entries if e.is_dir() and not e.name.startswith(".")]
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def natural_key(name: str) -> tuple[list[tuple[int, str]], str]:
+    """Sorting key under which numbers count by value: scan_9 before scan_10."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts], name
+
+
+def sequence_names(names: Iterable[str | int] | str | int, digits: int = 0) -> tuple[str, ...]:
+    """Sequence names from a setting; a bare number gets its leading zeros back (`[09,10]` arrives as "09", 10).
+
+    Args:
+        names: several names, or a single one.
+        digits: to which numbers are filled up.
+    """
+    several = [names] if isinstance(names, (str, int)) else names
+    return tuple(f"{name:0{digits}d}" if isinstance(name, int) else str(name) for name in several)
+
+
+def gaps(numbers: list[int]) -> list[tuple[int, int]]:
+    """First and last number of each hole in an ascending count."""
+    return [(a + 1, b - 1) for a, b in itertools.pairwise(numbers) if b > a + 1]
+
+
+def warn_of_gaps(sequence: str, scans: ScanFiles) -> None:
+    """Log where the numbering of a sequence's scans has holes: neighbours there are not one period apart."""
+    if holes := gaps(scans.numbers):
+        _log.warning(
+            "%s: %d gaps in the numbering of the scans in %s, the first from %d to %d",
+            sequence, len(holes), scans.folder, *holes[0],
+        )  # fmt: skip
+
+
+def read_float32_rows(path: Path, columns: int) -> Float[Tensor, "n c"]:
+    """A file of nothing but float32 rows: KITTI's x, y, z [m], reflectance in [0, 1].
+
+    Raises:
+        DamagedFileError: absent, empty, truncated, or not finite.
+    """
+    data = read_bytes(path, bytes_per_point=4 * columns)
+    rows = torch.from_numpy(np.frombuffer(data, "<f4").reshape(-1, columns))
+    if not rows.isfinite().all():
+        bad = int((~rows.isfinite()).any(dim=1).sum())
+        raise DamagedFileError(path, f"{bad} of {len(rows)} points are not finite")
+    return rows
+
+
+def read_bytes(path: Path, bytes_per_point: int) -> bytearray:
+    """The content of a file of points, writable so that tensors can share it.
+
+    Raises:
+        DamagedFileError: absent, empty, or the size is no multiple of a point's.
+    """
+    try:
+        data = bytearray(path.read_bytes())
+    except OSError as error:
+        raise DamagedFileError(path, f"cannot be read: {error.strerror}") from error
+    if not data:
+        raise DamagedFileError(path, "the file is empty")
+    if len(data) % bytes_per_point:
+        raise DamagedFileError(
+            path, f"truncated: its {len(data)} bytes are no multiple of the {bytes_per_point} bytes of a point"
+        )
+    return data

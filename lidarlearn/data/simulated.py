@@ -1,0 +1,259 @@
+"""Simulated drives, kept on disk as range images."""
+
+import copy
+import json
+import os
+import re
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from filelock import FileLock
+from rich.progress import Progress
+
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.simulation.drive import Drive
+from lidarlearn.simulation.sensors import Sensor
+from lidarlearn.simulation.trajectories import read_poses
+from lidarlearn.simulation.worlds import preset
+
+_SOURCE = "it is simulated on the spot: call prepare(), as train.py and evaluate.py do"
+
+
+class SimulatedSequence(Sequence):
+    """A simulated drive whose range images lie on disk.
+
+    Args:
+        drive: the settings; nothing is simulated as long as its images are there.
+        folder: of the images.
+        frames: number of scans to offer, at most the drive's.
+    """
+
+    def __init__(self, drive: Drive, folder: Path, frames: int) -> None:
+        self.name, self._sensor, self._folder, self._frames = drive.name, drive.sensor, folder, frames
+        assert drive.T_world_lidar is not None and drive.timestamps is not None
+        self.T_world_lidar, self.timestamps = drive.T_world_lidar[:frames], drive.timestamps[:frames]
+        self._timed, self._fingerprint = drive.motion_distortion, drive.fingerprint
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan.
+
+        Raises:
+            DamagedFileError: the file is missing or truncated.
+        """
+        if not 0 <= index < self._frames:
+            raise IndexError(f"{self.name} has scans 0 to {self._frames - 1}, asked for {index}")
+        path = image_path(self._folder, index)
+        try:
+            ranges = np.load(path)
+        except (OSError, ValueError, EOFError) as problem:
+            raise DamagedFileError(path, f"no range image: {problem}", "delete the file; it is made anew") from problem
+        if ranges.shape != (self._sensor.beams, self._sensor.columns) or ranges.dtype != np.uint16:
+            raise DamagedFileError(
+                path, f"a {ranges.dtype} array of {ranges.shape}", "delete the file; it is made anew"
+            )
+        points, times = self._sensor.points(ranges, index)
+        return Scan(torch.from_numpy(points), torch.from_numpy(times) if self._timed else None)
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of the drive's settings."""
+        return f"{self._fingerprint}-{self._frames}"
+
+
+class SimulatedDataSet(DataSet):
+    """Drives through simulated worlds, made by `prepare` and kept under a fingerprint of their settings.
+
+    A sequence is called `<world>_<number>`: each number has a world and a way of its own, so that different numbers
+    for training, validation and test are different places.
+
+    Args:
+        root: folder of the range images; any two settings can share it.
+        projection: the image of the sensor.
+        world: "urban", "highway", "campus" or "segway".
+        sensor: None for the one that belongs to the world.
+        train_sequences: names of the sequences to train on.
+        val_sequences: names of the sequences by which the best checkpoint is chosen.
+        test_sequences: names of the sequences that an evaluation runs.
+        frames: scans of a drive.
+        seed: of all drives.
+        speed: constant speed from the first scan on [m/s]; None drives as one does there.
+        static: leave out everything that moves.
+        motion_distortion: cast every column from its own pose, and give times with the points.
+        pose_file: path to drive, in KITTI's format, one pose per scan; None makes one for each sequence.
+        pose_file_frame: "camera" for poses of KITTI's left camera, "lidar" for the sensor's own.
+        max_frames: keep only the first scans of each sequence, and make no more; None keeps all.
+        deskew: whether odometries compensate the motion within a scan.
+        beam_correction_deg: there is nothing to correct in simulated scans: must be 0.
+        workers: threads that make scans; None for one per processor, at most 8. Their number changes nothing else.
+    """
+
+    title = "simulated"
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        projection: SphericalProjection,
+        world: str = "urban",
+        sensor: Sensor | None = None,
+        train_sequences: Iterable[str] = (),
+        val_sequences: Iterable[str] = (),
+        test_sequences: Iterable[str] = (),
+        frames: int = 200,
+        seed: int = 0,
+        speed: float | None = None,
+        static: bool = False,
+        motion_distortion: bool = False,
+        pose_file: str | os.PathLike[str] | None = None,
+        pose_file_frame: str = "camera",
+        max_frames: int | None = None,
+        deskew: bool = False,
+        beam_correction_deg: float = 0.0,
+        workers: int | None = None,
+    ) -> None:
+        self.root, self.projection, self.world, self.sensor = Path(root), projection, world, sensor
+        self.title = f"simulated {world}"
+        self.train_sequences, self.val_sequences = tuple(train_sequences), tuple(val_sequences)
+        self.test_sequences = tuple(test_sequences)
+        self.frames, self.seed, self.speed, self.static = frames, seed, speed, static
+        self.motion_distortion, self.pose_file, self.pose_file_frame = motion_distortion, pose_file, pose_file_frame
+        self.max_frames, self.deskew, self.beam_correction_deg = max_frames, deskew, beam_correction_deg
+        self.workers = min(os.cpu_count() or 1, 8) if workers is None else workers
+
+    def sequence(self, name: str) -> SimulatedSequence:
+        """Open a sequence.
+
+        Raises:
+            DataSetNotFoundError: it was not made yet, or it has the name of another world.
+        """
+        drive = self._drive(name)
+        folder, frames = self.folder(drive), self._wanted(drive)
+        missing = _missing(folder, range(frames))
+        if missing:
+            raise DataSetNotFoundError(self.title, f"scan {missing[0]} of sequence {name}", folder, _SOURCE)
+        return SimulatedSequence(drive, folder, frames)
+
+    def check(self) -> LayoutReport:
+        """Which sequences were made already; those that were not can be made at any time."""
+        report = LayoutReport()
+        for name in self._names():
+            try:
+                drive = self._drive(name)
+            except DataSetNotFoundError as problem:
+                report.missing(name, str(problem))
+                continue
+            frames = self._wanted(drive)
+            made = frames - len(_missing(self.folder(drive), range(frames)))
+            note = report.found if made == frames else report.odd
+            note(name, f"{made} of {frames} scans in {self.folder(drive)}" + ("" if made == frames else "; " + _SOURCE))
+        return report
+
+    def prepare(self) -> None:
+        """Make the scans that are missing, with a progress bar; safe when two processes do it, or one is killed."""
+        drives = [self._drive(name) for name in self._names()]
+        if not any(_missing(self.folder(drive), range(self._wanted(drive))) for drive in drives):
+            return
+        self.root.mkdir(parents=True, exist_ok=True)
+        with FileLock(self.root / "simulation.lock"):
+            missing = [(d, self.folder(d), _missing(self.folder(d), range(self._wanted(d)))) for d in drives]
+            jobs = [job for job in missing if job[2]]
+            for drive, _, _ in jobs:
+                self._describe(drive)
+            if jobs:
+                _make(jobs, self.workers, f"Simulating {self.world} drives")
+
+    def folder(self, drive: Drive) -> Path:
+        """Where the range images of a drive lie."""
+        return self.root / f"{drive.name}_{drive.fingerprint}"
+
+    def _names(self) -> list[str]:
+        return list(dict.fromkeys((*self.train_sequences, *self.val_sequences, *self.test_sequences)))
+
+    def _wanted(self, drive: Drive) -> int:
+        return len(drive) if self.max_frames is None else min(len(drive), self.max_frames)
+
+    def _drive(self, name: str) -> Drive:
+        match = re.fullmatch(rf"{re.escape(self.world)}_(\d+)", name)
+        if match is None:
+            problem = f"sequence {name!r} (the sequences are called {self.world}_00, {self.world}_01, ...)"
+            raise DataSetNotFoundError(self.title, problem, self.root, _SOURCE, "data.train_sequences")
+        preset(self.world)
+        poses = None if self.pose_file is None else read_poses(Path(self.pose_file), self.pose_file_frame == "camera")
+        return Drive(
+            self.world,
+            seed=100_000 * self.seed + int(match[1]),
+            frames=self.frames,
+            sensor=self.sensor,
+            speed=self.speed,
+            static=self.static,
+            motion_distortion=self.motion_distortion,
+            poses=poses,
+            name=name,
+        )
+
+    def _describe(self, drive: Drive) -> None:
+        """Write beside the images how they came about, for people who wonder."""
+        folder = self.folder(drive)
+        folder.mkdir(parents=True, exist_ok=True)
+        settings = {"world": self.world, "seed": drive.seed, "frames": len(drive), "sensor": drive.sensor.name}
+        settings |= {"columns": drive.sensor.columns, "static": self.static, "speed": self.speed}
+        (folder / "settings.json").write_text(json.dumps(settings, indent=2))
+
+
+def image_path(folder: Path, index: int) -> Path:
+    """File of one range image."""
+    return folder / f"{index:06d}.npy"
+
+
+def _missing(folder: Path, indices: Iterable[int]) -> list[int]:
+    """Those of the scans that have no file yet."""
+    there = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
+    return [i for i in indices if image_path(folder, i).name not in there]
+
+
+_Job = tuple[Drive, Path, list[int]]
+
+
+def _make(jobs: list[_Job], workers: int, title: str) -> None:
+    """Simulate and write the scans of all jobs, each one drive; drives are shared out where workers would be idle."""
+    parts = max(1, workers // len(jobs))
+    portions = [(drive, folder, indices[k::parts]) for drive, folder, indices in jobs for k in range(parts)]
+    total = sum(len(indices) for _, _, indices in jobs)
+    stop = threading.Event()
+    # Threads do, and need no importable main module: ray casting and numpy's loops run without the interpreter's lock.
+    with Progress(transient=True) as progress, ThreadPoolExecutor(max(1, workers)) as pool:
+        bar = progress.add_task(title, total=total)
+        running = {pool.submit(_work, portion, stop, partial(progress.advance, bar)) for portion in portions}
+        try:
+            for future in as_completed(running):
+                future.result()
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+
+
+def _work(job: _Job, stop: threading.Event, advance: Callable[[], None]) -> None:
+    drive, folder, indices = copy.copy(job[0]), job[1], job[2]  # the copy's world is let go at the end
+    for index in indices:
+        if stop.is_set():
+            return
+        _write(drive, folder, index)
+        advance()
+
+
+def _write(drive: Drive, folder: Path, index: int) -> None:
+    """Write one range image so that it is either whole or not there."""
+    path = image_path(folder, index)
+    draft = path.with_suffix(".tmp")
+    with draft.open("wb") as file:
+        np.save(file, drive.ranges(index))
+    draft.replace(path)

@@ -1,0 +1,1 @@
+"""Run methods over sequences, export their trajectories, score them from the files, report and plot."""

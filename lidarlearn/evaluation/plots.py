@@ -1,0 +1,249 @@
+"""Figures of an evaluation; each function returns a Figure, for a file and for TensorBoard alike.
+
+Figures are made without pyplot, whose list of open figures would grow with a training, and drawn without a screen.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from collections.abc import Sequence as Series
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from lidarlearn.data.sequence import Sequence
+from lidarlearn.evaluation.score import Score, pool_by_length
+from lidarlearn.geometry import se3
+from lidarlearn.metrics.failures import MAX_ROTATION_DEG, MAX_TRANSLATION_M
+from lidarlearn.metrics.kitti import SegmentAverage
+from lidarlearn.metrics.relative import relative_errors, speeds
+
+Poses = Float[Tensor, "n 4 4"]
+
+_DPI = 120
+_TRUTH = "#4d4d4d"
+# Okabe and Ito's palette, told apart with any colour vision; the line style changes when it is used up.
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+_STYLES = ("-", "--", ":")
+_KMH = 3.6
+
+
+def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str, Poses]) -> Figure:
+    """Bird's-eye view of trajectories, all from the same start, to the same scale in both directions.
+
+    Args:
+        title: what is shown, e.g. the name of the sequence.
+        T_true: ground-truth poses of the LiDAR; None where there are none.
+        T_estimates: estimated poses of the LiDAR by method.
+    """
+    truth = None if T_true is None else _bird_eye(T_true)
+    paths = {method: _bird_eye(T_world) for method, T_world in T_estimates.items()}
+    lower, upper = _view([*paths.values(), *([] if truth is None else [truth])], truth)
+    width, height = (upper - lower).tolist()
+    figure = Figure(figsize=(7, 7 * height / width + 0.5), dpi=_DPI, layout="constrained")
+    axes = figure.add_subplot()
+    if truth is not None:
+        axes.plot(*truth.mT.numpy(), color=_TRUTH, linewidth=4, alpha=0.45, label="ground truth")
+    for i, (method, path) in enumerate(paths.items()):
+        axes.plot(*path.mT.numpy(), linewidth=1.5, label=method, **_line(i))
+    axes.plot(0, 0, marker="o", markersize=7, color="black", linestyle="none", label="start", zorder=5)
+    axes.set_xlim(float(lower[0]), float(upper[0]))
+    axes.set_ylim(float(lower[1]), float(upper[1]))
+    axes.set_aspect("equal")
+    axes.legend(frameon=False)
+    _finish(axes, title, "x, forward at the start [m]", "y, left at the start [m]")
+    return figure
+
+
+def drift_figure(title: str, averages: Mapping[str, Mapping[int, SegmentAverage]]) -> Figure:
+    """KITTI's translation and rotation error over the length of the segment.
+
+    Args:
+        title: what is shown.
+        averages: mean errors by segment length [m], by method.
+    """
+    figure = Figure(figsize=(10, 4), dpi=_DPI, layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for i, (method, by_length) in enumerate(averages.items()):
+        lengths = list(by_length)
+        style: dict[str, Any] = {"marker": "o", "markersize": 4, "label": method, **_line(i)}
+        left.plot(lengths, [a.translation_percent for a in by_length.values()], **style)
+        right.plot(lengths, [a.rotation_deg_per_100m for a in by_length.values()], **style)
+    for axes in (left, right):
+        axes.set_ylim(bottom=0)
+    _finish(left, title, "segment length [m]", "translation error [%]")
+    _finish(right, "", "segment length [m]", "rotation error [deg/100 m]")
+    _legend_beside(figure, left)
+    return figure
+
+
+def speed_figure(title: str, true_kmh: Float[Tensor, "n"], estimated_kmh: Mapping[str, Float[Tensor, "_"]]) -> Figure:
+    """How often each speed was driven, by the ground truth and by the estimates.
+
+    Args:
+        title: what is shown.
+        true_kmh: speed between scans [km/h]; empty where there is no ground truth.
+        estimated_kmh: the same of the estimates, by method.
+
+    Source: Dellenbach et al. 2021, IV-B, the figure on the distribution of the speed.
+    """
+    figure = Figure(figsize=(7, 4), dpi=_DPI, layout="constrained")
+    axes = figure.add_subplot()
+    everything = torch.cat([torch.zeros(0, dtype=torch.float64), *estimated_kmh.values()])
+    edges = _speed_edges(true_kmh, everything)
+    if len(true_kmh):
+        _histogram(axes, true_kmh, edges, color=_TRUTH, alpha=0.35, label="ground truth")
+    for i, (method, kmh) in enumerate(estimated_kmh.items()):
+        _histogram(axes, kmh, edges, histtype="step", linewidth=1.5, label=method, **_line(i))
+    axes.set_xlim(edges[0], edges[-1])
+    axes.legend(frameon=False)
+    beyond = " (the last bin holds all beyond)" if len(everything) and float(everything.max()) > edges[-1] else ""
+    _finish(axes, title, f"speed [km/h]{beyond}", f"share of scans [%] per {edges[1] - edges[0]:g} km/h")
+    return figure
+
+
+def frame_error_figure(title: str, T_true: Poses, T_estimates: Mapping[str, Poses]) -> Figure:
+    """Error of every motion between consecutive scans, on a logarithmic scale, with the limits of a failure.
+
+    Args:
+        title: what is shown.
+        T_true: ground-truth poses.
+        T_estimates: estimated poses by method, as many as there are true ones.
+    """
+    figure = Figure(figsize=(10, 6), dpi=_DPI, layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for i, (method, T_world) in enumerate(T_estimates.items()):
+        errors = relative_errors(T_world, T_true)
+        frames = np.arange(1, len(errors.translation) + 1)
+        style: dict[str, Any] = {"linewidth": 0.6, "label": method, **_line(i)}
+        upper.plot(frames, _positive(errors.translation), **style)
+        lower.plot(frames, _positive(errors.rotation.rad2deg()), **style)
+    for axes, limit in ((upper, MAX_TRANSLATION_M), (lower, MAX_ROTATION_DEG)):
+        axes.axhline(limit, color=_TRUTH, linewidth=1, linestyle=(0, (6, 3)), label="failure")
+        axes.set_yscale("log")
+    _finish(upper, title, "", "translation error [m]")
+    _finish(lower, "", "scan", "rotation error [deg]")
+    _legend_beside(figure, upper)
+    return figure
+
+
+def figures(
+    sequences: Mapping[str, Sequence],
+    T_world_lidar: Mapping[str, Mapping[str, Poses]],
+    scores: Series[Score],
+) -> Iterator[tuple[str, Figure]]:
+    """All figures of an evaluation, one by one, with the names of their files.
+
+    Args:
+        sequences: opened sequences by name.
+        T_world_lidar: estimated poses of the LiDAR, by method and sequence.
+        scores: of the same methods and sequences.
+    """
+    for name, sequence in sequences.items():
+        estimates = {method: poses[name] for method, poses in T_world_lidar.items() if name in poses}
+        yield f"trajectories_{name}", trajectory_figure(f"sequence {name}", sequence.T_world_lidar, estimates)
+        if sequence.T_world_lidar is not None and len(sequence) > 1:
+            yield f"frame_errors_{name}", frame_error_figure(f"sequence {name}", sequence.T_world_lidar, estimates)
+    drifts = {method: pool_by_length([row for row in scores if row.method == method]) for method in T_world_lidar}
+    drifts = {method: by_length for method, by_length in drifts.items() if by_length}
+    over = f"{len(sequences)} sequences" if len(sequences) > 3 else "sequence " + ", ".join(sequences)
+    if drifts:
+        yield "error_over_distance", drift_figure(over, drifts)
+    true_kmh = _all_speeds(sequences, {n: s.T_world_lidar for n, s in sequences.items() if s.T_world_lidar is not None})
+    estimated_kmh = {method: _all_speeds(sequences, poses) for method, poses in T_world_lidar.items()}
+    if any(len(kmh) for kmh in (true_kmh, *estimated_kmh.values())):
+        yield "speed_distribution", speed_figure(over, true_kmh, estimated_kmh)
+
+
+def write_plots(folder: Path, named_figures: Iterator[tuple[str, Figure]]) -> list[Path]:
+    """Write figures as PNG files.
+
+    Args:
+        folder: made if it is not there.
+        named_figures: as `figures` gives them.
+
+    Returns:
+        The files.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, figure in named_figures:
+        path = folder / f"{name}.png"
+        figure.savefig(path)
+        paths.append(path)
+    return paths
+
+
+def _line(index: int) -> dict[str, Any]:
+    """Colour and line style of the index-th method, the same in every figure."""
+    style = _STYLES[index // len(_COLOURS) % len(_STYLES)]
+    return {"color": _COLOURS[index % len(_COLOURS)], "linestyle": style}
+
+
+def _finish(axes: Axes, title: str, x: str, y: str) -> None:
+    """Labels and grid as all figures have them."""
+    axes.set_title(title, loc="left")
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(color="0.9", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _legend_beside(figure: Figure, axes: Axes) -> None:
+    """One legend for several axes that show the same methods, where it hides nothing."""
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
+
+
+def _bird_eye(T_world: Poses) -> Float[Tensor, "n 2"]:
+    """Positions in the ground plane, seen from the first pose [m]."""
+    return (se3.inverse(T_world[:1]) @ T_world)[:, :2, 3].cpu()
+
+
+def _view(paths: Series[Float[Tensor, "_ 2"]], truth: Float[Tensor, "n 2"] | None) -> Float[Tensor, "2 2"]:
+    """Lower and upper corner of what is shown [m]: everything, unless a path leaves the truth far behind."""
+    points = torch.cat(list(paths))
+    corners = torch.stack([points.amin(0), points.amax(0)])
+    if truth is not None:
+        lower, upper = truth.amin(0), truth.amax(0)
+        reach = (upper - lower).max()
+        corners = torch.stack([corners[0].maximum(lower - reach), corners[1].minimum(upper + reach)])
+    extent = (corners[1] - corners[0]).max().clamp(min=1)
+    missing = (0.4 * extent - (corners[1] - corners[0])).clamp(min=0) / 2  # a straight drive gets some room around it
+    margin = 0.05 * extent + missing
+    return corners + torch.stack([-margin, margin])
+
+
+def _positive(errors: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
+    """What a logarithmic axis can show: exact zeros become gaps."""
+    return torch.where(errors > 0, errors, torch.nan).cpu()
+
+
+def _all_speeds(sequences: Mapping[str, Sequence], poses: Mapping[str, Poses]) -> Float[Tensor, "_"]:
+    """Speeds [km/h] over all the given sequences that have time stamps, one after the other."""
+    parts = [torch.zeros(0, dtype=torch.float64)]
+    for name, T_world in poses.items():
+        timestamps = sequences[name].timestamps
+        if timestamps is not None:
+            parts.append(_KMH * speeds(T_world.cpu(), timestamps))
+    return torch.cat(parts)
+
+
+def _speed_edges(true_kmh: Float[Tensor, "_"], estimated_kmh: Float[Tensor, "_"]) -> list[float]:
+    """Edges of about forty round bins [km/h], up to half as fast again as was driven; faster ones share the last."""
+    fastest = float(estimated_kmh.max()) if len(estimated_kmh) else 0.0
+    if len(true_kmh):
+        fastest = max(float(true_kmh.max()), min(fastest, 1.5 * float(true_kmh.max()) + 5))
+    width = next((w for w in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0) if fastest <= 40 * w), 10.0)
+    return [width * i for i in range(max(1, math.ceil(fastest / width)) + 1)]
+
+
+def _histogram(axes: Axes, kmh: Float[Tensor, "n"], edges: list[float], **style: Any) -> None:
+    """Share of the scans [%] in each bin; speeds beyond the last edge count in the last bin."""
+    shown = kmh.clamp(max=edges[-1]).numpy()
+    axes.hist(shown, edges, weights=np.full(len(shown), 100 / max(1, len(shown))), **style)

@@ -1,0 +1,201 @@
+"""Reports of an evaluation: results.json for programs, results.md and the terminal for people."""
+
+import json
+import math
+from collections.abc import Callable, Collection, Mapping
+from collections.abc import Sequence as Series
+from dataclasses import asdict
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from lidarlearn.evaluation.published import published_beside, whole_kitti_sequences
+from lidarlearn.evaluation.score import Averages, Score, average_scores
+from lidarlearn.evaluation.tables import Table
+
+_UNDEFINED = "-"
+_PIPE_WIDTH = 200  # characters, where there is no terminal to ask
+
+
+def write_report(
+    folder: Path, protocol: Mapping[str, Any], scores: Series[Score], trained_on: Collection[str] = ()
+) -> None:
+    """Write `results.json` and `results.md` into a folder.
+
+    Args:
+        folder: the run folder; made if it is not there.
+        protocol: how the scores came about; `protocol["data"]` is the name of the data group. Plain values, paths
+            and nested mappings and lists of these.
+        scores: all methods on all sequences, in the order in which they are to be shown.
+        trained_on: names of the scored sequences on which a scored network was trained; marked in the table.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    content = {
+        "protocol": protocol,
+        "results": [asdict(row) for row in scores],
+        "averages": [asdict(row) for row in average_scores(scores)],
+    }
+    text = json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / "results.json").write_text(text + "\n", encoding="utf-8")
+    tables = report_tables(str(protocol.get("data", "")), scores, trained_on)
+    body = "\n".join(table.markdown() for table in tables)
+    (folder / "results.md").write_text(f"# Results\n\n{body}\n{_protocol_markdown(protocol)}", encoding="utf-8")
+
+
+def print_tables(
+    data: str, scores: Series[Score], trained_on: Collection[str] = (), console: Console | None = None
+) -> None:
+    """Print the tables of `results.md` to the terminal, or to another console.
+
+    Args:
+        data: name of the data group.
+        scores: as for `write_report`.
+        trained_on: as for `write_report`.
+        console: where to print; None takes the standard output.
+    """
+    out = console or Console()
+    if console is None and not out.is_terminal:
+        out = Console(width=_PIPE_WIDTH)
+    for table in report_tables(data, scores, trained_on):
+        table.print(out)
+
+
+def report_tables(data: str, scores: Series[Score], trained_on: Collection[str] = ()) -> list[Table]:
+    """The paper's kind of table, one column a sequence, then everything else, one row a method and sequence."""
+    return [drift_table(data, scores, trained_on), details_table(scores)]
+
+
+def drift_table(data: str, scores: Series[Score], trained_on: Collection[str] = ()) -> Table:
+    """Average translation error of each method on each sequence and both averages, with published rows where due."""
+    sequences = list(dict.fromkeys(row.sequence for row in scores))
+    cells = {(row.method, row.sequence): _drift_cell(row) for row in scores}
+    averages = average_scores(scores)
+    complete = max((row.mean_over_sequences.sequences for row in averages), default=0)
+    rows = [
+        (row.method, *(cells.get((row.method, name), _UNDEFINED) for name in sequences), *_means(row, complete))
+        for row in averages
+    ]
+    marked = [f"{name}*" if name in trained_on else name for name in sequences]
+    reference = _reference_rows(data, scores, sequences)
+    return Table(
+        title="Average translation error [%], KITTI metric",
+        columns=("method", *marked, "mean of sequences", "mean of segments"),
+        rows=tuple(rows),
+        reference=tuple(reference),
+        notes=tuple(_drift_notes(scores, trained_on, sequences, bool(reference))),
+        lowest=frozenset(range(1, len(sequences) + 3)),
+    )
+
+
+def details_table(scores: Series[Score]) -> Table:
+    """Every other figure, one row for each method and sequence."""
+    columns: dict[str, Callable[[Score], str]] = {
+        "method": lambda row: row.method,
+        "sequence": lambda row: row.sequence,
+        "path [m]": lambda row: _text(row.path_length_m, 1),
+        "rot. [deg/100 m]": lambda row: _text(row.avg_rotation_error_deg_per_100m, 3),
+        "APE [m]": lambda row: _text(row.ape_rmse_m, 3),
+        "RPE [cm]": lambda row: _text(row.rpe_translation_m, 2, 100.0),
+        "RPE mean [cm]": lambda row: _text(row.rpe_translation_mean_m, 2, 100.0),
+        "RPE [deg]": lambda row: _text(row.rpe_rotation_deg, 3),
+        "motion [%]": lambda row: _text(row.relative_translation_error_percent, 2),
+        "fails": lambda row: _text(row.registration_failures, 0),
+        "scans/s": lambda row: _text(row.frames_per_second, 1),
+    }
+    return Table(
+        title="Further errors, and speed",
+        columns=tuple(columns),
+        rows=tuple(tuple(cell(row) for cell in columns.values()) for row in scores),
+        notes=(
+            "rot.: average rotation error, KITTI metric. "
+            "APE: position after rigid alignment of the whole trajectory, RMSE. "
+            "RPE: motion between consecutive scans, RMSE unless it says mean. "
+            "motion: mean error of that motion over its mean length. "
+            "fails: registration failures, motions off by more than 1 m or 3 deg. -: not defined.",
+        ),
+        labels=2,
+    )
+
+
+def _drift_cell(row: Score) -> str:
+    """The percentage; where the drive is too short for it, the mean error between scans stands in, in brackets."""
+    if row.avg_translation_error_percent is not None:
+        return _text(row.avg_translation_error_percent, 3)
+    if row.rpe_translation_mean_m is not None:
+        return f"{_UNDEFINED} ({_text(row.rpe_translation_mean_m, 2, 100.0)} cm)"
+    return _UNDEFINED
+
+
+def _means(row: Averages, complete: int) -> tuple[str, str]:
+    """Both averages; those over fewer sequences than other methods have say so."""
+    counted = row.mean_over_sequences.sequences
+    suffix = f" ({counted} of {complete})" if 0 < counted < complete else ""
+    over_sequences = row.mean_over_sequences.avg_translation_error_percent
+    over_segments = row.mean_over_segments.avg_translation_error_percent
+    return _text(over_sequences, 3) + suffix, _text(over_segments, 3) + suffix
+
+
+def _reference_rows(data: str, scores: Series[Score], sequences: Series[str]) -> list[tuple[str, ...]]:
+    """Published rows beside whole KITTI sequences; averages only over the very sequences that are averaged here."""
+    whole = whole_kitti_sequences(data, scores)
+    averaged = list(dict.fromkeys(row.sequence for row in scores if row.segments))
+    rows = []
+    for published in published_beside(data, scores):
+        errors = published.errors_percent
+        mean = published.sequence_mean_percent(averaged) if set(averaged) <= set(whole) else None
+        pooled = published.segment_mean_percent if len(averaged) == len(whole) == 11 else ""
+        cells = (errors.get(name, _UNDEFINED) if name in whole else _UNDEFINED for name in sequences)
+        rows.append((f"{published.method} (published)", *cells, _text(mean, 3), pooled or _UNDEFINED))
+    return rows
+
+
+def _drift_notes(
+    scores: Series[Score], trained_on: Collection[str], sequences: Series[str], has_reference: bool
+) -> list[str]:
+    notes = [
+        "Mean over segments of 100 to 800 m. Two averages are in use: every sequence counts the same (mean of "
+        "sequences), or every segment of all sequences (mean of segments), as on the KITTI benchmark."
+    ]
+    if any(row.segments == 0 for row in scores):
+        notes.append(
+            "- (x cm): the drive holds no segment of 100 m, so the metric is not defined; in brackets the mean "
+            "error of the translation between consecutive scans."
+        )
+    if any(row.path_length_m is None for row in scores):
+        notes.append("-: no ground truth.")
+    if any(name in trained_on for name in sequences):
+        notes.append("*: a network scored here was trained on this sequence.")
+    if has_reference:
+        notes.append(
+            "published: as printed by the authors or re-run by others, for whole sequences; not measured here. Numbers "
+            "after the name of a network are the sequences that it was trained on."
+        )
+    return notes
+
+
+def _protocol_markdown(protocol: Mapping[str, Any]) -> str:
+    lines = [f"- {key}: {_inline(_plain(value))}" for key, value in protocol.items()]
+    return "### Protocol\n\n" + "\n".join(lines) + "\n"
+
+
+def _inline(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def _text(value: float | int | None, digits: int, scale: float = 1.0) -> str:
+    return _UNDEFINED if value is None or not math.isfinite(value) else f"{scale * value:.{digits}f}"
+
+
+def _plain(value: Any) -> Any:
+    """The same in types that JSON has; floats that are not finite are not defined, hence null."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(item) for item in value]
+    if isinstance(value, PathLike):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

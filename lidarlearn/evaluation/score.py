@@ -1,0 +1,237 @@
+"""Score a trajectory against the ground truth of its sequence, and average scores over sequences."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Sequence as Series
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.data.sequence import Sequence
+from lidarlearn.evaluation.trajectories import TrajectoryError, to_reference_frame
+from lidarlearn.metrics import kitti
+from lidarlearn.metrics.absolute import ape_rmse
+from lidarlearn.metrics.failures import registration_failures
+from lidarlearn.metrics.kitti import SegmentAverage
+from lidarlearn.metrics.relative import relative_pose_error, relative_translation_error
+
+_SCAN_PERIOD_S = 0.1  # of a spinning LiDAR, where a sequence has no time stamps
+
+Number = TypeVar("Number", int, float)
+
+
+@dataclass(frozen=True)
+class Score:
+    """One row of `results.json`: a method on a sequence. Whatever is not defined is None, never 0.
+
+    Trajectories (KITTI, APE, RPE) are compared in the frame in which the data set defines its poses, registrations
+    (relative translation error, failures) in that of the LiDAR, in which they are made.
+
+    Args:
+        method: as in the paper, e.g. "cv+p_f2m".
+        sequence: name of the sequence.
+        frames: number of scans.
+        path_length_m: of the ground truth.
+        segments: number of KITTI's segments of 100 to 800 m.
+        avg_translation_error_percent: their mean translation error; what the paper calls ATE.
+        avg_rotation_error_deg_per_100m: their mean rotation error.
+        ape_rmse_m: absolute pose error after rigid alignment, root mean square.
+        rpe_translation_m: relative pose error of consecutive scans, root mean square.
+        rpe_translation_mean_m: the same, mean.
+        rpe_rotation_deg: its angle, root mean square.
+        relative_translation_error_percent: mean error of the motion between scans as a share of the mean motion.
+        registration_failures: motions between scans that are off by more than 1 m or 3 deg.
+        frames_per_second: of the odometry; None for trajectories of other tools.
+        by_segment_length: mean errors over KITTI's segments of each length [m].
+        health: what the odometry says about itself, as means over the sequence.
+    """
+
+    method: str
+    sequence: str
+    frames: int
+    path_length_m: float | None = None
+    segments: int | None = None
+    avg_translation_error_percent: float | None = None
+    avg_rotation_error_deg_per_100m: float | None = None
+    ape_rmse_m: float | None = None
+    rpe_translation_m: float | None = None
+    rpe_translation_mean_m: float | None = None
+    rpe_rotation_deg: float | None = None
+    relative_translation_error_percent: float | None = None
+    registration_failures: int | None = None
+    frames_per_second: float | None = None
+    by_segment_length: Mapping[int, SegmentAverage] = field(default_factory=dict)
+    health: Mapping[str, float | int | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MeanOverSequences:
+    """Means of a method's scores in which every sequence counts the same, however long.
+
+    Args:
+        sequences: how many sequences have KITTI's segments; only they are in the two averages of KITTI's metric.
+        registration_failures: the sum over the sequences.
+
+    The other figures are those of `Score`, each a mean over the sequences for which it is defined.
+    """
+
+    sequences: int
+    avg_translation_error_percent: float | None
+    avg_rotation_error_deg_per_100m: float | None
+    ape_rmse_m: float | None
+    rpe_translation_m: float | None
+    rpe_translation_mean_m: float | None
+    rpe_rotation_deg: float | None
+    relative_translation_error_percent: float | None
+    registration_failures: int | None
+    frames_per_second: float | None
+
+
+@dataclass(frozen=True)
+class MeanOverSegments:
+    """KITTI's metric over the segments of all sequences pooled, as the benchmark's own table has it."""
+
+    segments: int
+    avg_translation_error_percent: float | None
+    avg_rotation_error_deg_per_100m: float | None
+
+
+@dataclass(frozen=True)
+class Averages:
+    """The two averages of a method that are in use, and often mixed up."""
+
+    method: str
+    mean_over_sequences: MeanOverSequences
+    mean_over_segments: MeanOverSegments
+
+
+def score(
+    method: str,
+    T_world_lidar: Float[Tensor, "n 4 4"],
+    sequence: Sequence,
+    frames_per_second: float | None = None,
+    health: Mapping[str, float | int | None] | None = None,
+) -> Score:
+    """Score the poses that a method gave for a sequence; every error is None where there is no ground truth.
+
+    Args:
+        method: name of the method.
+        T_world_lidar: its absolute poses of the LiDAR, one a scan; the first one may be any.
+        sequence: the sequence, with its ground truth; no scan is read.
+        frames_per_second: how fast the method was.
+        health: summary of what the odometry says about itself.
+
+    Raises:
+        TrajectoryError: the number of poses is not that of the scans, or a pose is not finite.
+    """
+    _check(method, T_world_lidar, sequence)
+    T_true = sequence.T_world_lidar
+    if T_true is None:
+        return Score(
+            method, sequence.name, len(T_world_lidar), frames_per_second=frames_per_second, health=health or {}
+        )
+    T_world_estimate = to_reference_frame(T_world_lidar, sequence.T_reference_lidar)
+    T_world_true = to_reference_frame(T_true, sequence.T_reference_lidar)
+    errors = kitti.segment_errors(T_world_estimate, T_world_true, _scan_period_s(sequence))
+    average = kitti.average(errors)
+    rpe = relative_pose_error(T_world_estimate, T_world_true)
+    motion_error = relative_translation_error(T_world_lidar, T_true)
+    return Score(
+        method=method,
+        sequence=sequence.name,
+        frames=len(T_world_lidar),
+        path_length_m=float(kitti.path_distances(T_world_true)[-1]),
+        segments=len(errors.length_m),
+        avg_translation_error_percent=None if average is None else average.translation_percent,
+        avg_rotation_error_deg_per_100m=None if average is None else average.rotation_deg_per_100m,
+        ape_rmse_m=ape_rmse(T_world_estimate, T_world_true),
+        rpe_translation_m=None if rpe is None else rpe.translation_rmse_m,
+        rpe_translation_mean_m=None if rpe is None else rpe.translation_mean_m,
+        rpe_rotation_deg=None if rpe is None else math.degrees(rpe.rotation_rmse_rad),
+        relative_translation_error_percent=None if motion_error is None else 100 * motion_error,
+        registration_failures=int(registration_failures(T_world_lidar, T_true).sum()) if len(T_true) > 1 else None,
+        frames_per_second=frames_per_second,
+        by_segment_length=kitti.average_by_length(errors),
+        health=health or {},
+    )
+
+
+def average_scores(scores: Iterable[Score]) -> list[Averages]:
+    """Both averages of every method, in the order in which methods first appear."""
+    by_method: dict[str, list[Score]] = {}
+    for row in scores:
+        by_method.setdefault(row.method, []).append(row)
+    return [Averages(method, _over_sequences(rows), _over_segments(rows)) for method, rows in by_method.items()]
+
+
+def pool_by_length(scores: Series[Score]) -> dict[int, SegmentAverage]:
+    """Mean errors over the segments of each length [m], those of all sequences pooled."""
+    pooled = {}
+    for length in sorted({length for row in scores for length in row.by_segment_length}):
+        parts = [row.by_segment_length[length] for row in scores if length in row.by_segment_length]
+        count = sum(part.segments for part in parts)
+        pooled[length] = SegmentAverage(
+            segments=count,
+            translation_percent=sum(part.segments * part.translation_percent for part in parts) / count,
+            rotation_deg_per_100m=sum(part.segments * part.rotation_deg_per_100m for part in parts) / count,
+        )
+    return pooled
+
+
+def _check(method: str, T_world_lidar: Tensor, sequence: Sequence) -> None:
+    where = f"'{method}' on sequence {sequence.name}"
+    if len(T_world_lidar) != len(sequence):
+        raise TrajectoryError(
+            f"{where}: {len(T_world_lidar)} poses for {len(sequence)} scans.\n"
+            "  change: give one pose a scan; if scans were left out on purpose, set data.max_frames alike"
+        )
+    if not bool(T_world_lidar.isfinite().all()):
+        first = int((~T_world_lidar.isfinite()).flatten(1).any(1).int().argmax())
+        raise TrajectoryError(
+            f"{where}: pose {first} is not finite.\n  change: this trajectory cannot be scored; run the method again"
+        )
+
+
+def _scan_period_s(sequence: Sequence) -> float:
+    """Median time between scans."""
+    if sequence.timestamps is None or len(sequence.timestamps) < 2:
+        return _SCAN_PERIOD_S
+    return float(sequence.timestamps.diff().median())
+
+
+def _over_sequences(rows: Series[Score]) -> MeanOverSequences:
+    def mean(value: Callable[[Score], float | None]) -> float | None:
+        defined = _defined(value(row) for row in rows)
+        return sum(defined) / len(defined) if defined else None
+
+    failures = _defined(row.registration_failures for row in rows)
+    return MeanOverSequences(
+        sequences=sum(bool(row.segments) for row in rows),
+        avg_translation_error_percent=mean(lambda row: row.avg_translation_error_percent),
+        avg_rotation_error_deg_per_100m=mean(lambda row: row.avg_rotation_error_deg_per_100m),
+        ape_rmse_m=mean(lambda row: row.ape_rmse_m),
+        rpe_translation_m=mean(lambda row: row.rpe_translation_m),
+        rpe_translation_mean_m=mean(lambda row: row.rpe_translation_mean_m),
+        rpe_rotation_deg=mean(lambda row: row.rpe_rotation_deg),
+        relative_translation_error_percent=mean(lambda row: row.relative_translation_error_percent),
+        registration_failures=sum(failures) if failures else None,
+        frames_per_second=mean(lambda row: row.frames_per_second),
+    )
+
+
+def _over_segments(rows: Series[Score]) -> MeanOverSegments:
+    pooled = list(pool_by_length(rows).values())
+    count = sum(part.segments for part in pooled)
+    if not count:
+        return MeanOverSegments(0, None, None)
+    return MeanOverSegments(
+        segments=count,
+        avg_translation_error_percent=sum(part.segments * part.translation_percent for part in pooled) / count,
+        avg_rotation_error_deg_per_100m=sum(part.segments * part.rotation_deg_per_100m for part in pooled) / count,
+    )
+
+
+def _defined(values: Iterable[Number | None]) -> list[Number]:
+    return [value for value in values if value is not None]

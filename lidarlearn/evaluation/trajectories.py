@@ -1,0 +1,220 @@
+"""Trajectory files: KITTI's (a 3x4 matrix a row) and TUM's (time, position, quaternion), and the frame they are in."""
+
+from collections.abc import Iterator
+from collections.abc import Sequence as Series
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from lidarlearn.data.pose_files import read_kitti_poses, read_tum_poses
+from lidarlearn.errors import UserError
+
+_KITTI_COLUMNS = 12
+_TUM_COLUMNS = 8
+_MAX_DEVIATION = 1e-2  # of R R^T from the identity; some tools write three digits
+
+
+class TrajectoryError(UserError):
+    """A trajectory file that is missing, cannot be read, or does not belong to its sequence."""
+
+
+def write_kitti(path: Path, T_world: Float[Tensor, "n 4 4"]) -> None:
+    """Write poses in KITTI's format: the 12 numbers of the upper 3x4 matrix a row, 13 significant digits."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(path, T_world[:, :3].flatten(1).cpu().numpy(), fmt="%.12e")
+
+
+def write_tum(path: Path, T_world: Float[Tensor, "n 4 4"], timestamps: Float[Tensor, "n"] | None) -> None:
+    """Write poses in TUM's format: time [s], position [m], quaternion (x y z w), w >= 0.
+
+    Args:
+        path: file to write; its folder is made.
+        T_world: absolute poses.
+        timestamps: of each pose [s]; None writes the number of the frame in its place.
+    """
+    times = torch.arange(len(T_world), dtype=torch.float64) if timestamps is None else timestamps
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        file.write("# time [s] tx ty tz [m] qx qy qz qw\n")
+        if not len(T_world):
+            return
+        quaternions = Rotation.from_matrix(T_world[:, :3, :3].cpu().numpy()).as_quat(canonical=True)
+        rows = np.concatenate([T_world[:, :3, 3].cpu().numpy(), quaternions], axis=1)
+        for time, row in zip(times.tolist(), rows, strict=True):
+            file.write(f"{time:.9f} " + " ".join(f"{value:.12e}" for value in row) + "\n")
+
+
+def read_trajectory(
+    path: Path, timestamps: Float[Tensor, "m"] | None = None, tolerance_s: float = 0.01
+) -> Float[Tensor, "n 4 4"]:
+    """Read poses from a file in KITTI's or TUM's format, told apart by the number of columns.
+
+    Args:
+        path: the file; blank lines and what follows a # are skipped.
+        timestamps: of the scans [s]. Each takes the pose of a TUM file that is nearest in time, others are left out;
+            where there are none the rows are taken as they stand.
+        tolerance_s: largest accepted distance in time between a scan and its pose.
+
+    Returns:
+        Absolute poses, float64, in the file's own frame; matrices as they stand in the file.
+
+    Raises:
+        TrajectoryError: the file is missing, in another format, or leaves a scan without a pose.
+        DamagedFileError: a row of it is malformed.
+    """
+    columns = _columns(path)
+    if columns == _KITTI_COLUMNS:
+        T_world = read_kitti_poses(path)
+        _require_rotations(path, T_world)
+        return T_world
+    if columns == _TUM_COLUMNS:
+        poses = read_tum_poses(path)
+        chosen = slice(None) if timestamps is None else _match(path, poses.timestamps, timestamps, tolerance_s)
+        return poses.T_world_body[chosen]
+    raise TrajectoryError(
+        f"{path.absolute()}: {columns} numbers in its first row.\n"
+        "  change: one pose a row, as 12 numbers (KITTI: 3x4 matrix) or 8 (TUM: time x y z qx qy qz qw), "
+        "separated by spaces"
+    )
+
+
+def to_lidar_frame(
+    T_world: Float[Tensor, "n 4 4"], frame: str, reference_frame: str, T_reference_lidar: Float[Tensor, "4 4"]
+) -> Float[Tensor, "n 4 4"]:
+    """Poses of the LiDAR from poses of the frame that a trajectory file is said to be in.
+
+    Args:
+        T_world: absolute poses of `frame`, relative to its own first pose or to any other.
+        frame: "camera" or "lidar", as stated by whoever made the file.
+        reference_frame: the frame of the data set's own poses, as in `Sequence.reference_frame`.
+        T_reference_lidar: from the LiDAR to it, as in `Sequence.T_reference_lidar`.
+
+    Raises:
+        TrajectoryError: the data set does not say where the stated frame is.
+    """
+    if frame == "lidar":
+        return T_world
+    if frame != reference_frame:
+        raise TrajectoryError(
+            f"trajectories are said to be in the frame '{frame}', but this data set only relates the frames "
+            f"{' and '.join(sorted({'lidar', reference_frame}))}.\n  change: state one of these frames"
+        )
+    return torch.linalg.inv(T_reference_lidar) @ T_world @ T_reference_lidar
+
+
+def to_reference_frame(
+    T_world_lidar: Float[Tensor, "n 4 4"], T_reference_lidar: Float[Tensor, "4 4"]
+) -> Float[Tensor, "n 4 4"]:
+    """Poses of the data set's reference frame from those of the LiDAR: T_cam = Tr T_velo Tr^-1 for KITTI.
+
+    The inverse is that of a general matrix, as Tr in KITTI's calibration is a rotation to seven digits only.
+    """
+    return T_reference_lidar @ T_world_lidar @ torch.linalg.inv(T_reference_lidar)
+
+
+def find_trajectories(path: Path, sequences: Series[str]) -> dict[str, dict[str, Path]]:
+    """Trajectory files of any tool, by method and sequence.
+
+    Args:
+        path: a file (for one sequence), a folder of `<sequence>.txt` or `.tum`, or a folder of such folders, one for
+            each method. A method is called as its folder; a single file's as the file unless that is the sequence.
+        sequences: names of all sequences to be scored.
+
+    Raises:
+        TrajectoryError: nothing is there, or a method lacks a sequence.
+    """
+    if path.is_file():
+        if len(sequences) != 1:
+            raise TrajectoryError(
+                f"{path}: one trajectory for {len(sequences)} sequences ({', '.join(sequences)}).\n"
+                "  change: name one sequence (data.test_sequences), or give a folder of <sequence>.txt"
+            )
+        method = path.absolute().parent.name if path.stem == sequences[0] else path.stem
+        return {method: {sequences[0]: path}}
+    if not path.is_dir():
+        raise TrajectoryError(
+            f"{path.absolute()}: no such file or folder of trajectories.\n  change: trajectories=PATH"
+        )
+    found = {folder.absolute().name: _in_folder(folder, sequences) for folder in _candidates(path)}
+    found = {method: files for method, files in found.items() if files}
+    if not found:
+        there = ", ".join(sorted(p.name for p in path.iterdir())[:8]) or "nothing"
+        raise TrajectoryError(
+            f"{path.absolute()}: no trajectory of the sequences {', '.join(sequences)}; there is: {there}.\n"
+            "  change: name the files <sequence>.txt (KITTI or TUM format), or set data.test_sequences"
+        )
+    for method, files in found.items():
+        missing = [name for name in sequences if name not in files]
+        if missing:
+            raise TrajectoryError(
+                f"{path.absolute()}: '{method}' has no trajectory for {', '.join(missing)}.\n"
+                f"  change: add the files, or set data.test_sequences={list(files)}"
+            )
+    return found
+
+
+def _candidates(path: Path) -> Iterator[Path]:
+    yield path
+    yield from sorted(p for p in path.iterdir() if p.is_dir())
+
+
+def _in_folder(folder: Path, sequences: Series[str]) -> dict[str, Path]:
+    """The file of each sequence that has one; .txt goes before .tum."""
+    files = {}
+    for name in sequences:
+        for path in (folder / f"{name}.txt", folder / f"{name}.tum"):
+            if path.is_file():
+                files[name] = path
+                break
+    return files
+
+
+def _columns(path: Path) -> int:
+    """Numbers in the first row of a trajectory file, which tell the format."""
+    if not path.is_file():
+        raise TrajectoryError(f"{path.absolute()}: no such trajectory.\n  change: trajectories=PATH")
+    with path.open(errors="replace") as file:
+        for line in file:
+            words = line.split("#")[0].split()
+            if words:
+                return len(words)
+    return 0
+
+
+def _require_rotations(path: Path, T_world: Float[Tensor, "n 4 4"]) -> None:
+    """Refuse matrices that are no motions, as columns in another order would make them."""
+    R = T_world[:, :3, :3]
+    deviation = (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs().amax((1, 2))
+    bad = (deviation > _MAX_DEVIATION) | (torch.linalg.det(R) < 0)
+    if bool(bad.any()):
+        row = int(bad.int().argmax())
+        raise TrajectoryError(
+            f"{path.absolute()}: the 3x3 part of row {row + 1} is not a rotation: {_short(R[row])}.\n"
+            "  change: write the upper 3x4 part of each pose row by row (r11 r12 r13 tx r21 ...)"
+        )
+
+
+def _short(R: Float[Tensor, "3 3"]) -> str:
+    return str([[round(value, 3) for value in row] for row in R.tolist()])
+
+
+def _match(
+    path: Path, times: Float[Tensor, "n"], timestamps: Float[Tensor, "m"], tolerance_s: float
+) -> Int[Tensor, "m"]:
+    """Index of the pose nearest in time to each scan."""
+    after = torch.searchsorted(times, timestamps).clamp(max=len(times) - 1)
+    before = (after - 1).clamp(min=0)
+    nearest = torch.where((times[after] - timestamps).abs() < (timestamps - times[before]).abs(), after, before)
+    far = (times[nearest] - timestamps).abs() > tolerance_s
+    if bool(far.any()):
+        scan = int(far.int().argmax())
+        raise TrajectoryError(
+            f"{path.absolute()}: {int(far.sum())} of {len(timestamps)} scans have no pose within {tolerance_s} s, the "
+            f"first is scan {scan} at {float(timestamps[scan]):.6f} s; the file's times run from {float(times[0]):.6f} "
+            f"to {float(times[-1]):.6f} s.\n  change: write the scans' own times, or one row a scan in KITTI's format"
+        )
+    return nearest

@@ -1,0 +1,92 @@
+"""Unsupervised training: point-to-plane alignment under projective association."""
+
+from abc import ABC, abstractmethod
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lidarlearn.geometry import se3
+from lidarlearn.geometry.normals import normal_map
+from lidarlearn.geometry.projection import SphericalProjection, activated
+from lidarlearn.losses.result import LossResult
+
+
+class ProjectiveLoss(nn.Module, ABC):
+    """L(T_ref_new) = 1/n_k sum rho over the n_k pixels activated in the reference and in the reprojected target.
+
+    The target is transformed by the estimate and projected into the reference; each of its points meets the reference
+    point of its pixel and that point's normal. Neither precomputed normals nor a KdTree are needed. Every pair of the
+    batch has its own mean, so that a pair weighs the same whatever its overlap; a pair without overlap counts as zero
+    and pulls nowhere.
+
+    A subclass says what one correspondence costs: `rho`.
+
+    Args:
+        normal_window: rows and columns of the neighbourhood of reference normals [px], odd.
+
+    Source: Dellenbach et al. 2021, III-B "Unsupervised training".
+    """
+
+    def __init__(self, normal_window: tuple[int, int] = (3, 5)) -> None:
+        super().__init__()
+        self.normal_window = (int(normal_window[0]), int(normal_window[1]))
+
+    @abstractmethod
+    def rho(
+        self, residuals: Float[Tensor, "*batch"], squared_distances: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Cost of correspondences.
+
+        Args:
+            residuals: signed distance of each target point to its reference point's plane [m].
+            squared_distances: squared distance between the two points [m^2].
+        """
+
+    def forward(
+        self,
+        parameters: Float[Tensor, "batch 6"],
+        reference: Float[Tensor, "batch 3 h w"],
+        target: Float[Tensor, "batch 3 h w"],
+        projection: SphericalProjection,
+    ) -> LossResult:
+        """How badly the estimate aligns the two scans.
+
+        Args:
+            parameters: the network's estimate of `T_ref_new`: translation [m] and Euler angles [rad].
+            reference: vertex map of the earlier scan [m], zeros where no point fell.
+            target: vertex map of the new scan [m], likewise.
+            projection: the image that both were made with.
+        """
+        aligned = reproject(se3.from_euler(parameters), target, projection)
+        with torch.no_grad():
+            normals = normal_map(reference, window=self.normal_window)
+            used = activated(reference) & activated(aligned) & activated(normals)
+        offsets = aligned - reference
+        residuals = (offsets * normals).sum(dim=1)
+        squared_distances = (offsets * offsets).sum(dim=1)
+
+        def mean_over_used(values: Float[Tensor, "batch h w"]) -> Float[Tensor, ""]:
+            n_k = used.sum(dim=(1, 2)).clamp(min=1)
+            return ((values * used).sum(dim=(1, 2)) / n_k).mean()
+
+        return LossResult(
+            loss=mean_over_used(self.rho(residuals, squared_distances)),
+            parts={
+                "residual_m": mean_over_used(residuals.detach().abs()),
+                "distance_m": mean_over_used(squared_distances.detach().sqrt()),
+                "activated_share": used.float().mean(),
+            },
+        )
+
+
+def reproject(
+    T_ref_new: Float[Tensor, "batch 4 4"],
+    target: Float[Tensor, "batch 3 h w"],
+    projection: SphericalProjection,
+) -> Float[Tensor, "batch 3 h w"]:
+    """The target's points in the reference frame, in the pixels where the reference would see them."""
+    points = se3.transform(T_ref_new, target.flatten(2).mT)
+    # Empty pixels are zeros; transformed they would become points, back at the origin they fall into no pixel.
+    points = torch.where(activated(target).flatten(1)[..., None], points, 0.0)
+    return projection.vertex_map(points)

@@ -1,0 +1,32 @@
+"""The paper's weighted ICP loss."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.losses.projective import ProjectiveLoss
+
+
+class WeightedIcpLoss(ProjectiveLoss):
+    """Weighted squared point-to-plane distance: rho = w r^2 with w = exp(-|p - q|^2 / sigma^2).
+
+    The weight says how far an association is to be believed and is held fixed under differentiation, as in the
+    registration's iteratively reweighted least squares. With a gradient through it, a correspondence farther than
+    sigma would lower its cost by moving away: trained on KITTI 04 that loss settles on no motion at all.
+
+    Args:
+        sigma_m: distance at which an association counts 1/e [m].
+        normal_window: rows and columns of the neighbourhood of reference normals [px], odd.
+
+    Source: Dellenbach et al. 2021, III-B "Unsupervised training"; weights as in III-A "Energy minimized".
+    """
+
+    def __init__(self, sigma_m: float = 0.5, normal_window: tuple[int, int] = (3, 5)) -> None:
+        super().__init__(normal_window)
+        self.sigma_m = sigma_m
+
+    def rho(
+        self, residuals: Float[Tensor, "*batch"], squared_distances: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """w r^2 of each correspondence [m^2]."""
+        weights = (-squared_distances.detach() / self.sigma_m**2).exp()
+        return weights * residuals * residuals

@@ -1,0 +1,21 @@
+"""What every metric asks of the two trajectories it compares."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def check_comparable(T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Tensor, "m 4 4"]) -> None:
+    """Two trajectories can be compared pose by pose.
+
+    Raises:
+        ValueError: their numbers of poses differ, they are not in double precision, or hold values that are not finite.
+    """
+    if len(T_estimate) != len(T_ground_truth):
+        raise ValueError(f"{len(T_estimate)} estimated poses against {len(T_ground_truth)} of the ground truth")
+    for name, T in (("estimated", T_estimate), ("ground-truth", T_ground_truth)):
+        if T.dtype != torch.float64:
+            raise ValueError(f"{name} poses are {T.dtype}, metrics need float64")
+        finite = T.isfinite().all(-1).all(-1)
+        if not bool(finite.all()):
+            raise ValueError(f"{name} pose {int((~finite).int().argmax())} holds values that are not finite")

@@ -1,0 +1,1 @@
+"""Networks that regress the motion between two scans."""

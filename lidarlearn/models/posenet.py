@@ -1,0 +1,92 @@
+"""PoseNet: a residual network that regresses the relative pose of two scans from their vertex maps."""
+
+from typing import Literal
+
+import torch
+import torchvision
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+Backbone = Literal["resnet18", "resnet34", "resnet50"]
+
+INITIAL_HEAD_STD = 1e-3  # the untrained network says "hardly any motion", from where projective association works
+
+
+class PoseNet(nn.Module):
+    """Relative pose of a new scan in a reference scan, from the two vertex maps stacked in the channel dimension.
+
+    The six outputs are the translation [m] and the Euler angles [rad] of `T_ref_new`, see `se3.from_euler`.
+
+    Args:
+        backbone: one of torchvision's residual networks, with random weights.
+        input_scale_m: coordinates are divided by this, so that the network sees numbers around one [m].
+        rotation_scale: factor of the rotation head. Angles between scans are an order of magnitude smaller than
+            translations in metres; without the factor early steps rotate scans out of each other's view.
+        wrap_columns: pad convolutions with the columns from beyond the seam instead of zeros.
+
+    Source: Dellenbach et al. 2021, III-B "Deep LiDAR Odometries": ResNet-18, Euler angles.
+    """
+
+    output_scale: Tensor
+
+    def __init__(
+        self,
+        backbone: Backbone = "resnet18",
+        input_scale_m: float = 20.0,
+        rotation_scale: float = 0.1,
+        wrap_columns: bool = True,
+    ) -> None:
+        super().__init__()
+        self.input_scale_m = input_scale_m
+        network = torchvision.models.get_model(backbone, weights=None, num_classes=6)
+        network.conv1 = nn.Conv2d(6, network.conv1.out_channels, kernel_size=7, stride=2, padding=3, bias=False)
+        nn.init.normal_(network.fc.weight, std=INITIAL_HEAD_STD)
+        nn.init.zeros_(network.fc.bias)
+        if wrap_columns:
+            _wrap_columns(network)
+        self.network = network
+        self.register_buffer("output_scale", torch.tensor([1.0] * 3 + [rotation_scale] * 3), persistent=False)
+
+    def forward(
+        self, reference: Float[Tensor, "batch 3 h w"], target: Float[Tensor, "batch 3 h w"]
+    ) -> Float[Tensor, "batch 6"]:
+        """Parameters (x, y, z [m], roll, pitch, yaw [rad]) of `T_ref_new`.
+
+        Args:
+            reference: vertex map of the earlier scan [m], zeros where no point fell.
+            target: vertex map of the new scan [m], likewise, each in its own sensor frame.
+        """
+        return self.network(torch.cat([reference, target], dim=1) / self.input_scale_m) * self.output_scale
+
+
+class ColumnWrappedConv2d(nn.Conv2d):
+    """A convolution whose columns wrap at the image's seam; rows are padded with zeros as usual."""
+
+    def forward(self, input: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch d i j"]:
+        """Convolve after padding the columns circularly."""
+        rows, columns = int(self.padding[0]), int(self.padding[1])
+        wrapped = pad(input, (columns, columns, 0, 0), mode="circular")
+        return nn.functional.conv2d(
+            wrapped, self.weight, self.bias, self.stride, (rows, 0), self.dilation, self.groups
+        )
+
+
+def _wrap_columns(network: nn.Module) -> None:
+    """Replace every padded convolution by one that wraps its columns; parameters keep their names and values."""
+    for name, child in network.named_children():
+        if isinstance(child, nn.Conv2d) and int(child.padding[1]) > 0:
+            wrapped = ColumnWrappedConv2d(
+                child.in_channels,
+                child.out_channels,
+                kernel_size=(child.kernel_size[0], child.kernel_size[1]),
+                stride=(child.stride[0], child.stride[1]),
+                padding=(int(child.padding[0]), int(child.padding[1])),
+                dilation=(child.dilation[0], child.dilation[1]),
+                groups=child.groups,
+                bias=child.bias is not None,
+            )
+            wrapped.load_state_dict(child.state_dict())
+            setattr(network, name, wrapped)
+        else:
+            _wrap_columns(child)

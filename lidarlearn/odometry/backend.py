@@ -1,0 +1,112 @@
+"""The registration half of an odometry: sampling, local map and Gauss-Newton under one name such as `kd_f2m`."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.odometry.deskew import deskew
+from lidarlearn.odometry.local_map import LocalMap
+from lidarlearn.odometry.sampling import Sampling
+from lidarlearn.registration.association.aggregated_points import AggregatedPoints
+from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
+
+_NORMAL_VOXEL_M = 0.4  # neighbourhoods for the normals of a new scan, which only generalized ICP needs
+
+
+@dataclass(frozen=True)
+class PreparedScan:
+    """The sampled points of a scan as measured, and which of them are registered.
+
+    Args:
+        points: points for the map [m].
+        times: share of the scan period of each, see `lidarlearn.data.sequence.Scan`.
+        is_query: whether a point is also registered.
+    """
+
+    points: Float[Tensor, "n 3"]
+    times: Float[Tensor, "n"] | None
+    is_query: Bool[Tensor, "n"]
+
+    def deskewed(self, T_previous_new: Float[Tensor, "4 4"]) -> Float[Tensor, "n 3"]:
+        """All points, compensated for the motion over one scan period."""
+        return deskew(self.points, self.times, T_previous_new)
+
+
+@dataclass
+class Backend:
+    """Registers scans against a local map.
+
+    Args:
+        sampling: which points are used.
+        local_map: the scans to register against.
+        registration: how.
+        max_search_distance_m: widest search, at the start and when the motion surprises [m].
+        hypothesis_points: points with which several initial poses are tried at once.
+    """
+
+    sampling: Sampling
+    local_map: LocalMap
+    registration: GaussNewton = field(default_factory=GaussNewton)
+    max_search_distance_m: float = 3.0
+    hypothesis_points: int = 600
+
+    def prepare(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None) -> PreparedScan:
+        """Sample a scan."""
+        sampled = self.sampling.sample(points)
+        is_query = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        is_query[sampled.query_index] = True
+        index = sampled.map_index
+        return PreparedScan(points[index], None if times is None else times[index], is_query[index])
+
+    def register(
+        self, scan: PreparedScan, T_previous_new: Tensor, T_world_previous: Tensor, surprise_m: float
+    ) -> RegistrationResult:
+        """Register a scan from one guess of its motion.
+
+        Args:
+            scan: the new scan.
+            T_previous_new: the guess.
+            T_world_previous: pose of the previous scan.
+            surprise_m: how far points were displaced from where they were predicted in the last scans [m].
+        """
+        queries = scan.deskewed(T_previous_new)[scan.is_query]
+        distance = min(self.registration.search_distance_m + 2 * surprise_m, self.max_search_distance_m)
+        T_world_new = T_world_previous @ T_previous_new
+        return self.registration.register(
+            queries, self.local_map.association, T_world_new, distance, self._normals(queries)
+        )
+
+    def best_hypothesis(
+        self, scan: PreparedScan, T_previous_new: Float[Tensor, "h 4 4"], T_world_previous: Tensor
+    ) -> Tensor:
+        """The guess, among several, from which a few points of the scan come to fit the map best, once registered.
+
+        The points are not deskewed: the guesses differ by more than the motion within a scan.
+        """
+        queries = scan.points[scan.is_query]
+        queries = queries[:: max(len(queries) // self.hypothesis_points, 1)]
+        result = self.registration.register(
+            queries,
+            self.local_map.association,
+            T_world_previous @ T_previous_new,
+            self.max_search_distance_m,
+            self._normals(queries),
+        )
+        best = (result.overlap * result.inlier_share).argmax()
+        return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar[best]))
+
+    def _normals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"] | None:
+        if not self.registration.residual.needs_normals:
+            return None
+        return neighbourhood_normals(points, _NORMAL_VOXEL_M)
+
+
+def neighbourhood_normals(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Float[Tensor, "n 3"]:
+    """Normals of a scan's points from the points in the voxels around each, zero where they span no plane."""
+    surface = AggregatedPoints(voxel_size_m, points.device)
+    surface.insert(points, frames=1)
+    index = surface.lookup((points / voxel_size_m).floor().long())
+    return torch.where((index >= 0)[:, None], surface.normals[index.clamp(min=0)], 0.0)

@@ -1,0 +1,31 @@
+"""Compensation of the sensor's motion during a scan."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+
+_STEPS = 256  # of the scan period; 0.1 ms at 10 Hz, 3 mm at 110 km/h
+
+
+def deskew(
+    points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None, T_previous_new: Float[Tensor, "4 4"]
+) -> Float[Tensor, "n 3"]:
+    """The points as if all were measured at the instant of the scan's pose, under constant velocity.
+
+    Args:
+        points: as measured [m], each in the sensor's frame of its own instant.
+        times: share of the scan period from the instant of the pose, see `lidarlearn.data.sequence.Scan`; None where
+            there is nothing to compensate.
+        T_previous_new: the motion over one scan period.
+    """
+    if times is None or not len(points):
+        return points
+    earliest, latest = times.min(), times.max()
+    step = ((times - earliest) / (latest - earliest).clamp(min=1e-6) * (_STEPS - 1)).round().long()
+    instants = torch.linspace(0, 1, _STEPS, device=points.device, dtype=torch.float64)
+    instants = earliest + instants * (latest - earliest)
+    T_pose_instant = se3.exp(instants[:, None] * se3.log(T_previous_new)).to(points.dtype)
+    R, t = T_pose_instant[:, :3, :3][step], T_pose_instant[:, :3, 3][step]
+    return (R @ points[..., None])[..., 0] + t

@@ -1,0 +1,73 @@
+"""The health record of a frame: whether its pose can be trusted, and why not."""
+
+import csv
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+Status = Literal["ok", "recovered", "coasted", "restarted"]
+
+
+@dataclass(frozen=True)
+class Health:
+    """What is known about the registration of one scan.
+
+    Args:
+        frame: index of the scan.
+        status: "ok"; "recovered": the first attempt was doubtful and the best of several was kept; "coasted": no
+            attempt was acceptable and the pose is predicted; "restarted": likewise, and the map was begun anew.
+        initialization: who made the initial guess: ni, cv, ei, posenet, start (several hypotheses) or recovery.
+        points: points that were registered.
+        iterations: Gauss-Newton steps.
+        converged: whether the steps ended below the tolerances.
+        overlap: share of the points that have a neighbour in the map.
+        inlier_share: share of those that fit it.
+        rmse_m: weighted root mean square of the residuals [m].
+        min_information: how much the map says about the weakest direction of motion, 0 (nothing) to 1.
+        degenerate: whether that is too little, so that the motion in this direction is a prediction.
+        weakest_direction: that direction in the sensor's frame: translation, then rotation times the mean range.
+        deviation_m: distance between the registered motion and constant velocity [m].
+        deviation_deg: angle between the two [deg].
+        implausible: whether that is more than a vehicle can do in one scan.
+    """
+
+    frame: int
+    status: Status = "ok"
+    initialization: str = "start"
+    points: int = 0
+    iterations: int = 0
+    converged: bool = True
+    overlap: float = 1.0
+    inlier_share: float = 1.0
+    rmse_m: float = 0.0
+    min_information: float = 1.0
+    degenerate: bool = False
+    weakest_direction: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    deviation_m: float = 0.0
+    deviation_deg: float = 0.0
+    implausible: bool = False
+
+    @property
+    def flagged(self) -> bool:
+        """Whether the pose should not be trusted blindly."""
+        return self.status != "ok" or self.degenerate or self.implausible
+
+
+_DIRECTION = ("tx", "ty", "tz", "rx", "ry", "rz")
+
+
+def write_health(path: Path, records: Iterable[Health]) -> None:
+    """Write one row per frame as CSV; the weakest direction takes six columns."""
+    names = [f.name for f in fields(Health) if f.name != "weakest_direction"]
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*names, "flagged", *(f"weakest_{axis}" for axis in _DIRECTION)])
+        for record in records:
+            row = asdict(record)
+            direction = row.pop("weakest_direction")
+            writer.writerow([*(_cell(row[n]) for n in names), record.flagged, *(_cell(v) for v in direction)])
+
+
+def _cell(value: object) -> object:
+    return f"{value:.6g}" if isinstance(value, float) else value

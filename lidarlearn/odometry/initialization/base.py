@@ -1,0 +1,33 @@
+"""What an initialization is."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class InitialMotion:
+    """A guess of the motion since the previous scan.
+
+    Args:
+        T_previous_new: the motion, float64.
+        source: who made the guess: an initialization may fall back to another.
+    """
+
+    T_previous_new: Float[Tensor, "4 4"]
+    source: str
+
+
+class Initialization(ABC):
+    """Guesses the motion of each new scan before it is registered; sees every scan once, in order."""
+
+    @abstractmethod
+    def predict(self, points: Float[Tensor, "n 3"], last_motion: Float[Tensor, "4 4"]) -> InitialMotion:
+        """Guess the motion between the previous scan and this one.
+
+        Args:
+            points: the new scan [m], in the sensor's frame.
+            last_motion: motion between the two previous scans as registered; the identity before there is one.
+        """

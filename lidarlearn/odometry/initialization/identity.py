@@ -1,0 +1,15 @@
+"""NI: no initialization."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.odometry.initialization.base import InitialMotion, Initialization
+
+
+class NoInitialization(Initialization):
+    """The sensor did not move. Source: Dellenbach et al. 2021, IV-A "NI"."""
+
+    def predict(self, points: Float[Tensor, "n 3"], last_motion: Float[Tensor, "4 4"]) -> InitialMotion:
+        """The identity."""
+        return InitialMotion(torch.eye(4, dtype=last_motion.dtype, device=last_motion.device), "ni")

@@ -1,0 +1,264 @@
+"""The odometry: one pose per scan, from an initialization and a registration backend."""
+
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.odometry.backend import Backend, PreparedScan
+from lidarlearn.odometry.health import Health
+from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
+from lidarlearn.odometry.initialization.base import Initialization
+from lidarlearn.registration.gauss_newton import RegistrationResult
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A scan's place in the trajectory.
+
+    Args:
+        T_world_lidar: its pose, float64; the first one is the identity.
+        health: whether to trust it.
+    """
+
+    T_world_lidar: Float[Tensor, "4 4"]
+    health: Health
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """When a registration is doubted.
+
+    Args:
+        min_points: fewest points that can be registered.
+        min_overlap: smallest acceptable share of points that have a neighbour in the map.
+        min_inlier_share: smallest acceptable share of those that fit it.
+        min_information: below it the weakest direction counts as degenerate.
+        max_deviation_m: largest plausible change of motion from one scan to the next [m]; 0.5 m at 10 Hz is an
+            acceleration of 50 m/s^2.
+        max_deviation_deg: largest plausible change of rotation from one scan to the next [deg].
+        restart_after: with so many scans in a row without an acceptable registration the map is begun anew.
+    """
+
+    min_points: int = 100
+    min_overlap: float = 0.1
+    min_inlier_share: float = 0.6
+    min_information: float = 0.005
+    max_deviation_m: float = 0.5
+    max_deviation_deg: float = 8.0
+    restart_after: int = 5
+
+
+class ScanByScan(ABC):
+    """Anything that takes scans in order and says where they were taken."""
+
+    @abstractmethod
+    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+        """Find the pose of the next scan.
+
+        Args:
+            points: the scan [m], in the sensor's frame; may be empty or hold values that are not finite.
+            times: when each point was measured, to compensate the motion within the scan; see
+                `lidarlearn.data.sequence.Scan`. None where there is nothing to compensate.
+        """
+
+
+class InitializationAlone(ScanByScan):
+    """Accumulates the guesses of an initialization, without any registration.
+
+    Args:
+        initialization: what guesses.
+        device: where it runs.
+    """
+
+    def __init__(self, initialization: Initialization, device: torch.device | str = "cpu") -> None:
+        self._initialization = initialization
+        self._device = torch.device(device)
+        self._motion = se3.identity(device=self._device)
+        self._T_world_lidar = se3.identity(device=self._device)
+        self._frames = 0
+
+    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+        """The previous pose and the guessed motion."""
+        points = points.to(self._device)
+        guess = self._initialization.predict(points[points.isfinite().all(dim=1)], self._motion)
+        if self._frames:
+            self._motion = guess.T_previous_new
+            self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ self._motion)
+        self._frames += 1
+        health = Health(self._frames - 1, initialization=guess.source, points=len(points))
+        return Frame(self._T_world_lidar.cpu(), health)
+
+
+class Odometry(ScanByScan):
+    """Registers each scan, from an initial guess of its motion, against a local map of the scans before it.
+
+    Args:
+        initialization: guesses the motion.
+        backend: samples, registers and keeps the map.
+        judgement: when a registration is doubted.
+        min_range_m: closer returns are dropped: the vehicle itself [m].
+        max_range_m: farther returns are dropped [m].
+        recovery: whether a doubtful registration is tried again from other motions, and the start from several.
+        device: where everything runs.
+
+    Source: Dellenbach et al. 2021, III-A.
+    """
+
+    def __init__(
+        self,
+        initialization: Initialization,
+        backend: Backend,
+        judgement: Judgement | None = None,
+        min_range_m: float = 2.5,
+        max_range_m: float = 100.0,
+        recovery: bool = True,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self._initialization = initialization
+        self._backend = backend
+        self._judgement = judgement or Judgement()
+        self._min_range_m = min_range_m
+        self._max_range_m = max_range_m
+        self._recovery = recovery
+        self._device = torch.device(device)
+        self._T_world_lidar = se3.identity(device=self._device)
+        self._motion = se3.identity(device=self._device)  # last one that was trusted
+        self._doubted_motion: Tensor | None = None
+        self._surprises_m: deque[float] = deque(maxlen=5)
+        self._frames = 0
+        self._coasting = 0
+
+    @torch.no_grad()
+    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+        """Guess the motion, register, judge, try again if in doubt, add the scan to the map."""
+        points, times = self._in_range(points, times)
+        guess = self._initialization.predict(points, self._motion)
+        scan = self._backend.prepare(points, times)
+        if self._backend.local_map.association.is_empty:
+            health = self._begin(scan)
+        else:
+            T_previous_new, source = guess.T_previous_new, guess.source
+            if self._frames == 1 and self._recovery:
+                T_previous_new, source = self._search(scan, start_motions().to(self._device)), "start"
+            health = self._advance(scan, T_previous_new, source)
+        self._frames += 1
+        return Frame(self._T_world_lidar.cpu(), health)
+
+    def _in_range(self, points: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        ranges = points.norm(dim=1)
+        valid = (ranges >= self._min_range_m) & (ranges <= self._max_range_m)  # false where not finite
+        points = points[valid].to(self._device)
+        return points, None if times is None else times[valid].to(self._device)
+
+    def _begin(self, scan: PreparedScan) -> Health:
+        """Start a map with a scan, at the origin or, after a loss, where the motion model puts it."""
+        status = "ok" if self._frames == 0 else "restarted"
+        if self._frames:
+            self._move(self._motion)
+        if self._has_enough_points(scan):
+            self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
+            self._coasting = 0
+        return Health(self._frames, status=status, points=len(scan.points))
+
+    def _advance(self, scan: PreparedScan, T_previous_new: Tensor, source: str) -> Health:
+        """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
+        if not self._has_enough_points(scan):
+            return self._coast(Health(self._frames, initialization=source, points=len(scan.points), overlap=0.0))
+        result = self._register(scan, T_previous_new)
+        health = self._assess(scan, result, source)
+        if self._recovery and source != "start" and (health.implausible or not self._accepts(result)):
+            hypotheses = surprise_motions(T_previous_new, self._motion)
+            second = self._register(scan, self._search(scan, hypotheses))
+            if _fit(second) > _fit(result):
+                result, health = second, self._assess(scan, second, "recovery")
+            health = replace(health, status="recovered")
+        if not self._accepts(result):
+            return self._coast(health)
+        self._surprises_m.append(self._displacement_m(scan, T_previous_new, result.T_world_lidar))
+        self._trust(self._motion_to(result.T_world_lidar), health)
+        self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
+        self._coasting = 0
+        return health
+
+    def _register(self, scan: PreparedScan, T_previous_new: Tensor) -> RegistrationResult:
+        surprise = max(self._surprises_m, default=math.inf)
+        return self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise)
+
+    def _search(self, scan: PreparedScan, T_previous_new: Float[Tensor, "h 4 4"]) -> Tensor:
+        return self._backend.best_hypothesis(scan, T_previous_new, self._T_world_lidar)
+
+    def _coast(self, health: Health) -> Health:
+        """Move as before; after too many scans without a registration, begin a new map."""
+        self._move(self._motion)
+        self._coasting += 1
+        if self._coasting >= self._judgement.restart_after:
+            self._backend.local_map.restart()
+        return replace(health, status="coasted")
+
+    def _trust(self, motion: Tensor, health: Health) -> None:
+        """Move, and take over the motion as the model of the next one if it is plausible or seen twice."""
+        self._move(motion)
+        confirmed = self._doubted_motion is not None and self._is_plausible(self._doubted_motion, motion)
+        if self._frames == 1 or not health.implausible or confirmed:
+            self._motion, self._doubted_motion = motion, None
+        else:
+            self._doubted_motion = motion
+
+    def _move(self, motion: Tensor) -> None:
+        self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ motion)
+
+    def _assess(self, scan: PreparedScan, result: RegistrationResult, source: str) -> Health:
+        deviation_m, deviation_deg = _difference(self._motion, self._motion_to(result.T_world_lidar))
+        information = result.information[0].item()
+        return Health(
+            frame=self._frames,
+            initialization=source,
+            points=int(scan.is_query.sum()),
+            iterations=result.iterations,
+            converged=bool(result.converged),
+            overlap=result.overlap.item(),
+            inlier_share=result.inlier_share.item(),
+            rmse_m=result.rmse_m.item(),
+            min_information=information,
+            degenerate=information < self._judgement.min_information,
+            weakest_direction=tuple(result.weakest_direction.tolist()),
+            deviation_m=deviation_m,
+            deviation_deg=deviation_deg,
+            implausible=self._frames > 1 and not self._is_plausible(self._motion, self._motion_to(result.T_world_lidar)),
+        )
+
+    def _accepts(self, result: RegistrationResult) -> bool:
+        judgement = self._judgement
+        return result.overlap.item() >= judgement.min_overlap and result.inlier_share.item() >= judgement.min_inlier_share
+
+    def _has_enough_points(self, scan: PreparedScan) -> bool:
+        return int(scan.is_query.sum()) >= self._judgement.min_points
+
+    def _is_plausible(self, before: Tensor, after: Tensor) -> bool:
+        deviation_m, deviation_deg = _difference(before, after)
+        return deviation_m <= self._judgement.max_deviation_m and deviation_deg <= self._judgement.max_deviation_deg
+
+    def _motion_to(self, T_world_new: Tensor) -> Tensor:
+        return se3.orthonormalize(se3.inverse(self._T_world_lidar) @ T_world_new)
+
+    def _displacement_m(self, scan: PreparedScan, T_previous_new: Tensor, T_world_new: Tensor) -> float:
+        """How far a point at the mean range was from where the guess had it."""
+        shift_m, angle_deg = _difference(T_previous_new, self._motion_to(T_world_new))
+        return shift_m + math.radians(angle_deg) * scan.points.norm(dim=1).mean().item()
+
+
+def _fit(result: RegistrationResult) -> float:
+    """Share of all points that fit the map."""
+    return (result.overlap * result.inlier_share).item()
+
+
+def _difference(T_a: Tensor, T_b: Tensor) -> tuple[float, float]:
+    """Distance [m] and angle [deg] between two motions."""
+    xi = se3.log(se3.inverse(T_a) @ T_b)
+    return xi[:3].norm().item(), math.degrees(xi[3:].norm().item())

@@ -1,0 +1,1 @@
+"""Registration of a scan against a map: associations, residuals, robust weights and the Gauss-Newton loop."""

@@ -1,0 +1,146 @@
+"""The last k scans aggregated, one point per voxel, with normals that grow with the map.
+
+Points stand in the order in which they came, so forgetting the oldest scans moves the start of a slice and nothing
+else. A table maps voxels to points: a point lives for k scans, an occupied voxel takes no second one meanwhile.
+"""
+
+import itertools
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarlearn.geometry.normals import fit_planes
+from lidarlearn.geometry.voxels import grid_sample, voxel_cells
+
+# The table wraps around in space: two voxels share a slot only if they are 512 (512, 64) cells apart, 205 m (26 m) at
+# 0.4 m, so neighbours never collide and stand side by side in memory.
+_TABLE_BITS = (9, 9, 6)
+_MIN_NEIGHBOURS = 3
+_MAX_ROUGHNESS = 0.5  # deviation from the plane over the smaller extent in it
+
+
+class AggregatedPoints:
+    """A growing and forgetting point cloud with one point per voxel, its normals kept up incrementally.
+
+    Each point carries the moments of the points in the 26 voxels around it. A new point adds itself to the moments of
+    its neighbours, so a normal costs work only when its neighbourhood changes.
+
+    Args:
+        voxel_size_m: edge of the voxels [m].
+        device: where the points are kept.
+
+    Source: Dellenbach et al. 2021, III-A "Local map and neighborhood"; the hashed grid after Niessner et al. 2013.
+    """
+
+    def __init__(self, voxel_size_m: float, device: torch.device) -> None:
+        self.voxel_size_m = voxel_size_m
+        self._device = device
+        self._offsets = neighbourhood(1, device)
+        self._offsets = self._offsets[(self._offsets != 0).any(dim=1)]
+        self._table = torch.full((1 << sum(_TABLE_BITS),), -1, dtype=torch.int32, device=device)
+        self._reserve(1 << 16)
+        self._start = self._end = 0
+        self._frame_starts: list[int] = []
+
+    @property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """All points of the map [m], oldest first."""
+        return self._points[self._start : self._end]
+
+    @property
+    def normals(self) -> Float[Tensor, "n 3"]:
+        """Unit normals of the points, sign arbitrary; zero where the neighbourhood is no plane."""
+        return self._normals[self._start : self._end]
+
+    def insert(self, points_world: Float[Tensor, "n 3"], frames: int) -> None:
+        """Add the points that fall into free voxels as one scan; keep the last `frames` scans."""
+        self._forget(frames - 1)
+        free = self.lookup(voxel_cells(points_world, self.voxel_size_m)) < 0
+        points_world = points_world[free]
+        points_world = points_world[grid_sample(points_world, self.voxel_size_m)]
+        if self._end + len(points_world) > len(self._points):
+            self._compact(len(points_world))
+        new = slice(self._end, self._end + len(points_world))
+        cells = voxel_cells(points_world, self.voxel_size_m)
+        self._points[new] = points_world
+        self._cells[new] = cells
+        self._table[_slots(cells)] = torch.arange(new.start, new.stop, dtype=torch.int32, device=self._device)
+        self._frame_starts.append(self._end)
+        self._end = new.stop
+        self._update_moments(new)
+
+    def lookup(self, cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
+        """Index into `points` of the point in each voxel, -1 where there is none."""
+        index = self._table[_slots(cells)].long()
+        alive = index >= self._start
+        same = (self._cells[index.clamp(min=0)] == cells).all(dim=-1)
+        return torch.where(alive & same, index - self._start, -1)
+
+    def _forget(self, frames: int) -> None:
+        dropped = max(len(self._frame_starts) - frames, 0)
+        self._frame_starts = self._frame_starts[dropped:]
+        self._start = self._frame_starts[0] if self._frame_starts else self._end
+
+    def _update_moments(self, new: slice) -> None:
+        """Let the new points and their neighbours count each other, and refit the planes that changed."""
+        neighbours = self.lookup(self._cells[new][:, None] + self._offsets)
+        row, column = (neighbours >= 0).nonzero(as_tuple=True)
+        index = neighbours[row, column] + self._start
+        d = self._points[index] - self._points[new][row]
+        x, y, z = d.unbind(-1)
+        ones = torch.ones_like(x)
+        squares = (x * x, x * y, x * z, y * y, y * z, z * z)
+        self._moments[new] = 0
+        self._moments[new].index_add_(0, row, torch.stack([ones, x, y, z, *squares], dim=1))
+        old = index < new.start  # pairs of new points occur twice, once from each side
+        mirrored = torch.stack([ones, -x, -y, -z, *squares], dim=1)
+        self._moments.index_add_(0, index[old], mirrored[old])
+        changed = torch.zeros(self._end - self._start, dtype=torch.bool, device=self._device)
+        changed[index - self._start] = True
+        changed[new.start - self._start :] = True
+        self._fit(changed.nonzero()[:, 0] + self._start)
+
+    def _fit(self, index: Int[Tensor, "m"]) -> None:
+        moments = self._moments[index]
+        n = moments[:, :1] + 1  # the point itself, at offset zero
+        mx, my, mz = (moments[:, 1:4] / n).unbind(-1)
+        outer = torch.stack([mx * mx, mx * my, mx * mz, my * my, my * mz, mz * mz], dim=1)
+        plane = fit_planes(moments[:, 4:] / n - outer)
+        self._normals[index] = plane.normals * _is_plane(moments[:, 0], plane.variances)[:, None]
+
+    def _compact(self, needed: int) -> None:
+        """Move the living points to the front of buffers that hold at least twice their number."""
+        living = slice(self._start, self._end)
+        old = (self._points[living], self._cells[living], self._moments[living], self._normals[living])
+        count = self._end - self._start
+        self._reserve(max(2 * (count + needed), len(self._points)))
+        for buffer, content in zip((self._points, self._cells, self._moments, self._normals), old, strict=True):
+            buffer[:count] = content
+        self._table.fill_(-1)
+        self._table[_slots(self._cells[:count])] = torch.arange(count, dtype=torch.int32, device=self._device)
+        self._frame_starts = [start - self._start for start in self._frame_starts]
+        self._start, self._end = 0, count
+
+    def _reserve(self, capacity: int) -> None:
+        self._points = torch.empty(capacity, 3, device=self._device)
+        self._cells = torch.empty(capacity, 3, dtype=torch.int64, device=self._device)
+        self._moments = torch.empty(capacity, 10, device=self._device)
+        self._normals = torch.empty(capacity, 3, device=self._device)
+
+
+def neighbourhood(radius: int, device: torch.device) -> Int[Tensor, "n 3"]:
+    """Offsets of all cells of the cube of edge 2 radius + 1 around a cell, itself included."""
+    steps = range(-radius, radius + 1)
+    return torch.tensor(list(itertools.product(steps, steps, steps)), device=device)
+
+
+def _is_plane(neighbours: Float[Tensor, "m"], variances: Float[Tensor, "m 3"]) -> Bool[Tensor, "m"]:
+    across, along = variances[:, 0], variances[:, 1]
+    return (neighbours >= _MIN_NEIGHBOURS) & (along > 0) & (across <= _MAX_ROUGHNESS**2 * along)
+
+
+def _slots(cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
+    bx, by, bz = _TABLE_BITS
+    x, y, z = cells.unbind(-1)
+    return ((x & ((1 << bx) - 1)) << (by + bz)) | ((y & ((1 << by) - 1)) << bz) | (z & ((1 << bz) - 1))

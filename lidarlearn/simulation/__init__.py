@@ -1,0 +1,1 @@
+"""Simulated drives: procedural worlds, smooth trajectories, spinning LiDARs and ray casting."""

@@ -1,0 +1,184 @@
+"""A simulated drive: scans in memory, straight from a few settings."""
+
+import hashlib
+from dataclasses import asdict
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt16
+
+from lidarlearn.data.sequence import Scan, Sequence
+from lidarlearn.simulation import motions
+from lidarlearn.simulation.movers import snapshot
+from lidarlearn.simulation.raycasting import RayCaster
+from lidarlearn.simulation.sensors import Sensor
+from lidarlearn.simulation.terrain import GroundBelow, Hills, Terrain
+from lidarlearn.simulation.trajectories import Trajectory, extended, on_ground
+from lidarlearn.simulation.worlds import World, build_world, preset
+
+# Part of every fingerprint: to be raised whenever the same settings come to give other scans.
+GENERATOR = 1
+
+# Each source of chance has a stream of its own, so that e.g. a static drive takes the way of the lively one.
+_TERRAIN, _MOTION, _WORLD, _SCAN = range(4)
+
+
+class Drive(Sequence):
+    """A drive through a simulated world. Scans are made when asked for; each depends on the settings alone.
+
+    Args:
+        world: "urban", "highway", "campus", "segway", or a world that was built already (then `poses` are needed).
+        seed: of everything left to chance; same seed, same bytes.
+        frames: number of scans.
+        sensor: None for the one that belongs to the world.
+        speed: constant speed from the first scan on [m/s]; None drives as one does there.
+        static: leave out everything that moves.
+        motion_distortion: cast every column from its own pose, and give times with the points.
+        poses: the sensor's path, `T_world_lidar` once per scan [m]; None makes one. Scenery is built around it.
+        name: of the sequence.
+    """
+
+    def __init__(
+        self,
+        world: str | World = "urban",
+        seed: int = 0,
+        frames: int = 100,
+        sensor: Sensor | None = None,
+        speed: float | None = None,
+        static: bool = False,
+        motion_distortion: bool = False,
+        poses: Float[np.ndarray, "n 4 4"] | None = None,
+        name: str | None = None,
+    ) -> None:
+        if frames < 1:
+            raise ValueError(f"a drive needs at least one frame, got {frames}")
+        if isinstance(world, World) and poses is None:
+            raise ValueError("a world of your own needs poses: Drive(world, poses=...)")
+        self.seed, self.static, self.motion_distortion, self.speed = seed, static, motion_distortion, speed
+        self._place = preset("urban" if isinstance(world, World) else world)
+        self._world_name = "custom" if isinstance(world, World) else world
+        self.sensor = self._place.sensor() if sensor is None else sensor
+        self.frames = frames if poses is None else min(frames, len(poses))
+        self.name = f"{self._world_name}_{seed:02d}" if name is None else name
+        # Scenery goes on beyond the last scan, but not along the whole of a long file.
+        self._given = None if poses is None else np.asarray(poses[: frames + 100], dtype=np.float64)
+        self._own = world if isinstance(world, World) else None
+        self.timestamps = torch.arange(self.frames, dtype=torch.float64) * self.sensor.period
+        T_map_lidar = torch.from_numpy(self.trajectory.at(self.timestamps.numpy()))
+        self.T_world_lidar = torch.linalg.inv(T_map_lidar[0]) @ T_map_lidar
+        self.T_world_lidar[0] = torch.eye(4, dtype=torch.float64)
+
+    def __len__(self) -> int:
+        return self.frames
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of the settings."""
+        settings = [GENERATOR, self._world_name, self.seed, self.frames, sorted(asdict(self.sensor).items())]
+        settings += [self.speed, self.static, self.motion_distortion]
+        digest = hashlib.sha256(repr(settings).encode())
+        if self._given is not None:
+            digest.update(self._given.tobytes())
+        if self._own is not None:
+            digest.update(self._own.static.vertices.tobytes())
+        return digest.hexdigest()[:16]
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without what Open3D holds and what can be made anew."""
+        return {key: value for key, value in self.__dict__.items() if key not in ("_caster", "world")}
+
+    def scan(self, index: int) -> Scan:
+        """Simulate one scan; its times are given when it is distorted by motion."""
+        points, times = self.sensor.points(self.ranges(index), index)
+        return Scan(torch.from_numpy(points), torch.from_numpy(times) if self.motion_distortion else None)
+
+    def ranges(self, index: int) -> UInt16[np.ndarray, "beams columns"]:
+        """The range image of one scan as the sensor reports it, in steps of `sensors.RANGE_STEP`."""
+        if not 0 <= index < self.frames:
+            raise IndexError(f"{self.name} has scans 0 to {self.frames - 1}, asked for {index}")
+        distances, cos_incidence = self._cast(index)
+        return self.sensor.measure(distances, cos_incidence, self._chance(_SCAN, index))
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The sensor's trajectory in the map frame, where the world is built."""
+        return self._motion[0]
+
+    @cached_property
+    def world(self) -> World:
+        """Everything that rays can hit, in the map frame."""
+        if self._own is not None:
+            return self._own
+        trajectory, terrain, track = self._motion
+        ego = trajectory.times, trajectory.poses[:, :2, 3]
+        return build_world(self._place, self._chance(_WORLD), terrain, track, ego, self.static)
+
+    @cached_property
+    def _motion(self) -> tuple[Trajectory, Terrain, np.ndarray]:
+        period = self.sensor.period
+        if self._given is not None:
+            times = period * np.arange(len(self._given))
+            feet = self._given[:, :3, 3] - self._place.vehicle.sensor_height * self._given[:, :3, 2]
+            return Trajectory(times, self._given), GroundBelow(feet), extended(feet[:, :2], 100.0)
+        terrain = Hills(self._chance(_TERRAIN), self._place.slope_deg)
+        rng, start, duration = self._chance(_MOTION), -2 * period, (self.frames + 3) * period
+        if self._place.driving is None:
+            motion = motions.segway(rng, start, duration, self.speed)
+        else:
+            motion = motions.drive(rng, self._place.driving, start, duration, self.speed)
+        return on_ground(motion, terrain, self._place.vehicle), terrain, motion.track
+
+    @cached_property
+    def _caster(self) -> RayCaster:
+        return RayCaster(self.world.static)
+
+    def _chance(self, *stream: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, *stream])
+
+    def _cast(self, index: int) -> tuple[Float[np.ndarray, "beams columns"], Float[np.ndarray, "beams columns"]]:
+        """True distances [m] and cosines of the angles of incidence of one scan."""
+        sensor, period = self.sensor, self.sensor.period
+        shares = sensor.column_times() if self.motion_distortion else np.zeros(1)
+        T_map_column = self.trajectory.at((index + shares) * period)
+        directions = sensor.directions(index, T_map_column[:, :3, :3])
+        rays = np.empty((sensor.beams, sensor.columns, 6), dtype=np.float32)
+        rays[..., :3] = T_map_column[:, :3, 3]
+        rays[..., 3:] = directions
+        hits = self._caster.cast(rays.reshape(-1, 6))
+        distances = hits.distances.reshape(rays.shape[:2])
+        cosines = np.abs(np.einsum("bck,bck->bc", hits.normals.reshape(directions.shape), directions))
+        if self.world.movers:
+            self._cast_movers(index, rays, distances, cosines)
+        return distances, cosines
+
+    def _cast_movers(self, index: int, rays: np.ndarray, distances: np.ndarray, cosines: np.ndarray) -> None:
+        """Put what moves in front of what does not, in place: only columns that may see it are cast again."""
+        sensor = self.sensor
+        sectors = 12 if self.motion_distortion else 1
+        for sector in np.array_split(np.arange(sensor.columns), sectors):
+            share = sensor.column_times()[sector].mean() if self.motion_distortion else 0.0
+            time = (index + share) * sensor.period
+            pose = self.trajectory.at(np.array([time]))[0]
+            mesh = snapshot(self.world.movers, time, pose[:3, 3], sensor.max_range)
+            columns = sector[_seen(mesh.vertices, pose, sensor.azimuths(index)[sector])]
+            if len(columns):
+                part = np.ascontiguousarray(rays[:, columns])
+                hits = RayCaster(mesh).cast(part.reshape(-1, 6))
+                found = hits.distances.reshape(part.shape[:2])
+                cosine = np.abs(np.einsum("bck,bck->bc", hits.normals.reshape(*part.shape[:2], 3), part[..., 3:]))
+                nearer = found < distances[:, columns]
+                distances[:, columns] = np.where(nearer, found, distances[:, columns])
+                cosines[:, columns] = np.where(nearer, cosine, cosines[:, columns])
+
+
+def _seen(vertices: np.ndarray, pose: np.ndarray, azimuths: np.ndarray) -> np.ndarray:
+    """Which azimuths come within 4 degrees of any vertex, or lie within 30 degrees where it is nearer than 6 m."""
+    local = (vertices - pose[:3, 3]) @ pose[:3, :3]
+    bins = np.zeros(180, dtype=bool)  # of 2 degrees
+    bearing = np.floor((np.arctan2(local[:, 1], local[:, 0]) + np.pi) / (2 * np.pi) * 180).astype(int)
+    near = np.hypot(local[:, 0], local[:, 1]) < 6.0
+    for reach, which in ((2, ~near), (15, near)):
+        for step in range(-reach, reach + 1):
+            bins[(bearing[which] + step) % 180] = True
+    return bins[np.floor((azimuths + np.pi) / (2 * np.pi) * 180).astype(int) % 180]

@@ -1,0 +1,57 @@
+"""Cars and people that move while the sensor drives by."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from lidarlearn.simulation.meshes import Mesh, merge
+
+
+@dataclass(frozen=True)
+class Mover:
+    """Something that moves along a line.
+
+    Args:
+        mesh: standing on the origin, facing x.
+        lane: points of the line on the ground [m].
+        times: at which its way is given [s].
+        way: arc length covered along the lane at these times [m]; off either end it is not there.
+    """
+
+    mesh: Mesh
+    lane: Float[np.ndarray, "n 3"]
+    times: Float[np.ndarray, "k"]
+    way: Float[np.ndarray, "k"]
+
+    @cached_property
+    def _arc_length(self) -> Float[np.ndarray, "n"]:
+        return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(self.lane, axis=0), axis=1))])
+
+    def position(self, time: float, ahead: float = 0.0) -> Float[np.ndarray, "3"] | None:
+        """Where it stands at a time [s], or the point `ahead` of that on its lane [m]; None where it is not there."""
+        end = self._arc_length[-1]
+        here = np.interp(time, self.times, self.way)
+        if not 0 <= here <= end:
+            return None
+        place = np.clip(here, 1.0, end - 1.0) + ahead
+        return np.array([np.interp(place, self._arc_length, self.lane[:, k]) for k in range(3)])
+
+    def at(self, time: float) -> Mesh | None:
+        """Its mesh where it is at a time [s]; None where it is not in the world then."""
+        centre, back, front = (self.position(time, ahead) for ahead in (0.0, -1.0, 1.0))
+        if centre is None or back is None or front is None:
+            return None
+        return self.mesh.moved(centre, float(np.arctan2(front[1] - back[1], front[0] - back[0])))
+
+
+def snapshot(movers: Sequence[Mover], time: float, centre: Float[np.ndarray, "3"], radius: float) -> Mesh:
+    """All movers within `radius` [m] of a point at a time [s], as one mesh."""
+    near = []
+    for mover in movers:
+        position = mover.position(time)
+        if position is not None and np.linalg.norm(position - centre) < radius:
+            near.append(mover.at(time))
+    return merge(mesh for mesh in near if mesh is not None)

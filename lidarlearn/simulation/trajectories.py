@@ -1,0 +1,148 @@
+"""Sensor trajectories in continuous time: a planar motion laid onto the ground, or any given poses."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from lidarlearn.errors import UserError
+from lidarlearn.simulation.terrain import Terrain
+
+# Axes of KITTI's left camera (x right, y down, z forward) in the LiDAR's (x forward, y left, z up).
+_R_LIDAR_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+
+
+@dataclass(frozen=True)
+class PlanarMotion:
+    """How a vehicle moves on a map.
+
+    Args:
+        times: of the samples, evenly spaced [s].
+        xy: position of the vehicle's reference point [m].
+        heading: direction in which it faces [rad], continuous.
+        speed: along its heading [m/s].
+        sway: pitch on top of what ground and acceleration cause, nose down positive [rad].
+        track: the way in space, from well before the first position to well beyond the last [m].
+    """
+
+    times: Float[np.ndarray, "n"]
+    xy: Float[np.ndarray, "n 2"]
+    heading: Float[np.ndarray, "n"]
+    speed: Float[np.ndarray, "n"]
+    sway: Float[np.ndarray, "n"]
+    track: Float[np.ndarray, "m 2"]
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What carries the sensor.
+
+    Args:
+        sensor_height: above the ground [m].
+        sensor_forward: of the reference point, which moves where it faces (the rear axle) [m].
+        wheelbase: distance of the axles, over which the ground is felt [m].
+        gauge: distance of left and right wheels [m].
+        squat: pitch per forward acceleration, nose up [rad per m/s^2].
+        lean: roll per lateral acceleration, outwards [rad per m/s^2].
+    """
+
+    sensor_height: float = 1.73
+    sensor_forward: float = 0.8
+    wheelbase: float = 2.7
+    gauge: float = 1.6
+    squat: float = 0.006
+    lean: float = 0.006
+
+
+class Trajectory:
+    """Sensor poses at any time, smooth in between.
+
+    Args:
+        times: of the given poses, increasing [s].
+        poses: `T_world_lidar` at these times.
+    """
+
+    def __init__(self, times: Float[np.ndarray, "n"], poses: Float[np.ndarray, "n 4 4"]) -> None:
+        self.times, self.poses = times, poses
+        self._position = CubicSpline(times, poses[:, :3, 3])
+        self._rotation = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
+
+    def at(self, times: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 4 4"]:
+        """`T_world_lidar` at the given times, which may lie a scan's length outside of the given ones."""
+        poses = np.tile(np.eye(4), (len(times), 1, 1))
+        poses[:, :3, :3] = self._rotation(times).as_matrix()
+        poses[:, :3, 3] = self._position(times)
+        return poses
+
+
+def on_ground(motion: PlanarMotion, terrain: Terrain, vehicle: Vehicle) -> Trajectory:
+    """The sensor's trajectory on a vehicle whose pitch and roll follow the ground below its four wheels.
+
+    Springs tilt it further under acceleration. Nothing jitters: ground and motion are smooth at the vehicle's scale.
+    """
+    forward = np.stack([np.cos(motion.heading), np.sin(motion.heading)], axis=-1)
+    left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
+    wheels = {
+        (i, j): terrain.height(motion.xy + i * vehicle.wheelbase * forward + j * vehicle.gauge / 2 * left)
+        for i in (0, 1)
+        for j in (-1, 1)
+    }
+    rear, front = (wheels[0, -1] + wheels[0, 1]) / 2, (wheels[1, -1] + wheels[1, 1]) / 2
+    rise_left = (wheels[0, 1] + wheels[1, 1] - wheels[0, -1] - wheels[1, -1]) / 2
+    step = motion.times[1] - motion.times[0]
+    acceleration = gaussian_filter1d(np.gradient(motion.speed, step), 0.3 / step, mode="nearest")
+    lateral = gaussian_filter1d(motion.speed * np.gradient(motion.heading, step), 0.3 / step, mode="nearest")
+    pitch = -np.arctan2(front - rear, vehicle.wheelbase) - vehicle.squat * acceleration + motion.sway
+    roll = np.arctan2(rise_left, vehicle.gauge) + vehicle.lean * lateral
+    poses = np.tile(np.eye(4), (len(rear), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("ZYX", np.stack([motion.heading, pitch, roll], axis=-1)).as_matrix()
+    mount = np.array([vehicle.sensor_forward, 0, vehicle.sensor_height])
+    poses[:, :3, 3] = np.column_stack([motion.xy, rear]) + poses[:, :3, :3] @ mount
+    return Trajectory(motion.times, poses)
+
+
+def read_poses(path: Path, camera: bool) -> Float[np.ndarray, "n 4 4"]:
+    """`T_world_lidar` from a file in KITTI's format (12 numbers a row).
+
+    Args:
+        path: the file.
+        camera: whether it holds poses of KITTI's left camera, as the odometry benchmark publishes them; their axes
+            are turned into the LiDAR's, the lever arm between the two is left out.
+
+    Raises:
+        UserError: the file is missing or does not hold two rows of 12 finite numbers.
+    """
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as problem:
+        raise UserError(f"pose file {path}: {problem}; give a file in KITTI's format, 12 numbers a row") from problem
+    if rows.shape[0] < 2 or rows.shape[1] != 12 or not np.isfinite(rows).all():
+        raise UserError(f"pose file {path}: shape {rows.shape}; expected two or more rows of 12 finite numbers")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    if camera:
+        C = np.eye(4)
+        C[:3, :3] = _R_LIDAR_CAMERA
+        poses = C @ poses @ C.T
+    # Digits lost in the file: the nearest rotation.
+    poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()
+    return poses
+
+
+def extended(xy: Float[np.ndarray, "n 2"], length: float) -> Float[np.ndarray, "m 2"]:
+    """A path thinned to 1 m and lengthened straight ahead at both ends by `length` [m]."""
+    steps = np.linalg.norm(np.diff(xy, axis=0), axis=1)
+    s = np.concatenate([[0], np.cumsum(steps)])
+    grid = np.arange(0, max(s[-1], 1.0), 1.0)
+    thinned = np.column_stack([np.interp(grid, s, xy[:, k]) for k in (0, 1)])
+    if len(thinned) < 3 or s[-1] < 3:
+        thinned = xy[:1] + np.column_stack([np.arange(3.0), np.zeros(3)])
+    ahead = np.arange(1.0, length)[:, None]
+    start, end = thinned[0] - thinned[2], thinned[-1] - thinned[-3]
+    before = thinned[0] + ahead[::-1] * start / np.linalg.norm(start)
+    after = thinned[-1] + ahead * end / np.linalg.norm(end)
+    return np.concatenate([before, thinned, after])

@@ -1,0 +1,115 @@
+"""What TensorBoard shows besides curves: images of the input and trajectories of held-out drives."""
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
+from matplotlib import colormaps
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from lidarlearn.evaluation.plots import trajectory_figure
+from lidarlearn.geometry.normals import normal_map
+from lidarlearn.geometry.projection import activated
+from lidarlearn.losses.projective import reproject
+from lidarlearn.training.module import PoseNetModule
+
+_IMAGE_ROWS = 192  # images are enlarged to about so many rows: beams are few and pages are high
+
+
+class InputImages(Callback):
+    """Images of the first held-out pair: range and normals of its reference, and how well the target falls onto it.
+
+    Args:
+        every_n_epochs: how often to draw them.
+        max_range_m: range at the far end of the colour scale [m].
+        max_residual_m: point-to-plane distance at the far end of its colour scale [m].
+    """
+
+    def __init__(self, every_n_epochs: int = 5, max_range_m: float = 60.0, max_residual_m: float = 1.0) -> None:
+        self.every_n_epochs = every_n_epochs
+        self.max_range_m = max_range_m
+        self.max_residual_m = max_residual_m
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: object,
+        batch: dict[str, Tensor],
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Draw the first pair of the first sequence."""
+        writer = _writer(trainer)
+        if writer is None or batch_idx or dataloader_idx or trainer.current_epoch % self.every_n_epochs:
+            return
+        assert isinstance(pl_module, PoseNetModule)
+        reference, target = batch["reference"][:1], batch["target"][:1]
+        aligned = reproject(pl_module.relative_pose(reference, target), target, pl_module.projection)
+        normals = normal_map(reference)
+        images = {
+            f"vertex map, range 0 to {self.max_range_m:g} m": range_image(reference[0], self.max_range_m),
+            "normal map": normal_image(normals[0]),
+            f"point-to-plane distance as predicted, 0 to {self.max_residual_m:g} m": scalar_image(
+                ((aligned - reference) * normals).sum(dim=1)[0].abs(),
+                (activated(normals) & activated(aligned))[0],
+                self.max_residual_m,
+            ),
+        }
+        for title, image in images.items():
+            writer.add_image(f"val/{title}", enlarged(image), trainer.current_epoch)
+
+
+class Trajectories(Callback):
+    """Each held-out drive as predicted, over its ground truth, as a figure.
+
+    Args:
+        every_n_epochs: how often to draw them.
+    """
+
+    def __init__(self, every_n_epochs: int = 1) -> None:
+        self.every_n_epochs = every_n_epochs
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the drives of this validation."""
+        writer = _writer(trainer)
+        if writer is None or trainer.current_epoch % self.every_n_epochs:
+            return
+        assert isinstance(pl_module, PoseNetModule)
+        for drive in pl_module.predicted_drives:
+            title = f"sequence {drive.name} after {trainer.current_epoch + 1} epochs"
+            figure = trajectory_figure(title, drive.T_world_lidar_true, {"posenet": drive.T_world_lidar})
+            writer.add_figure(f"val/trajectory {drive.name}", figure, trainer.current_epoch)
+
+
+def range_image(vertex_map: Float[Tensor, "3 h w"], max_range_m: float) -> Float[Tensor, "3 h w"]:
+    """Ranges in colour, square-root scaled so that near structure shows; black where no point fell."""
+    ranges = vertex_map.norm(dim=0)
+    return scalar_image(ranges.sqrt(), activated(vertex_map), max_range_m**0.5)
+
+
+def normal_image(normals: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
+    """Components of unit normals as red, green, blue, from -1 (dark) to 1 (bright); black where undefined."""
+    return torch.where(activated(normals), (normals + 1) / 2, 0.0)
+
+
+def scalar_image(values: Float[Tensor, "h w"], valid: Tensor, largest: float) -> Float[Tensor, "3 h w"]:
+    """Values from 0 to `largest` in colour; black where not valid."""
+    colours = torch.tensor(colormaps["turbo"].resampled(256).colors, dtype=torch.float32)[:, :3]
+    index = (values / largest * 255).clamp(0, 255).long().cpu()
+    return torch.where(valid.cpu(), colours[index].movedim(-1, 0), 0.0)
+
+
+def enlarged(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 i j"]:
+    """Every pixel repeated, a whole number of times."""
+    times = max(1, _IMAGE_ROWS // image.shape[1])
+    return image.repeat_interleave(times, dim=1).repeat_interleave(max(1, times // 2), dim=2)
+
+
+def _writer(trainer: Trainer) -> SummaryWriter | None:
+    """TensorBoard's writer in the one process that has it, outside of sanity checks."""
+    writers = [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+    if trainer.sanity_checking or not trainer.is_global_zero or not writers:
+        return None
+    return writers[0]

@@ -1,0 +1,45 @@
+"""Checkpoint files: plain data that says what it was trained on, loaded without running anything of it."""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lidarlearn.errors import UserError
+
+_NEEDED = ("module", "hyper_parameters", "state_dict")
+
+
+class CheckpointError(UserError):
+    """A file cannot be used as a checkpoint.
+
+    Args:
+        path: the file.
+        problem: what was seen.
+    """
+
+    def __init__(self, path: Path, problem: str) -> None:
+        super().__init__(
+            f"checkpoint {path.absolute()}: {problem}\n"
+            "  change: ckpt=RUN/checkpoints/best.ckpt (or last.ckpt) of a training run of lidarlearn"
+        )
+
+
+def load_checkpoint(path: Path, map_location: torch.device | str = "cpu") -> dict[str, Any]:
+    """The content of a checkpoint of this project; never unpickles objects.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, holds more than plain data, or comes from elsewhere.
+    """
+    if not path.is_file():
+        raise CheckpointError(path, "no such file.")
+    try:
+        checkpoint = torch.load(path, map_location=map_location, weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(path, "holds objects that only running its code could load, which is refused.") from error
+    except (RuntimeError, EOFError, OSError) as error:
+        raise CheckpointError(path, f"is damaged: {str(error).splitlines()[0]}") from error
+    if not isinstance(checkpoint, dict) or any(key not in checkpoint for key in _NEEDED):
+        raise CheckpointError(path, "was not written by lidarlearn's training.")
+    return checkpoint

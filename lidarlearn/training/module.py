@@ -1,0 +1,154 @@
+"""What supervised and unsupervised training of PoseNet share."""
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from torch import Tensor
+
+from lidarlearn.data.pairs import Pair
+from lidarlearn.data.sequence import Sequence
+from lidarlearn.geometry import se3
+from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.losses.result import LossResult
+from lidarlearn.training.checkpoints import load_checkpoint
+from lidarlearn.training.drives import PredictedDrive, drive_errors, mean_errors, predicted_drive
+from lidarlearn.training.parts import build
+
+
+class PoseNetModule(LightningModule):
+    """Trains a network that regresses relative poses; a subclass says by which signal.
+
+    All arguments are plain dicts, each with the `_target_` to build: a checkpoint holds them as its hyper-parameters
+    and rebuilds its own model, see `load_from_checkpoint`.
+
+    Args:
+        model: the network.
+        loss: what it minimizes.
+        optimizer: takes the parameters.
+        scheduler: takes the optimizer; steps once an epoch.
+        trained_on: what to tell about a checkpoint, for people and for `evaluate.py`: "data" (the data set's config),
+            "data_name", "loss", "git", "lidarlearn", and "projection" (height, width, fov_up_deg, fov_down_deg of the
+            network's image).
+    """
+
+    predicted_drives: list[PredictedDrive]
+
+    def __init__(
+        self,
+        model: dict[str, Any],
+        loss: dict[str, Any],
+        optimizer: dict[str, Any],
+        scheduler: dict[str, Any],
+        trained_on: dict[str, Any],
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters(logger=False)
+        self.projection = SphericalProjection(**trained_on["projection"])
+        self.trained_on = trained_on
+        self.model = build(model)
+        self.loss = build(loss)
+        self.predicted_drives = []
+        self._predictions: list[list[tuple[Tensor, Tensor]]] = []
+        self._val_losses: list[Tensor] = []
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]  # one argument is enough, the file holds the rest
+        cls, checkpoint_path: str | Path, map_location: torch.device | str = "cpu"
+    ) -> "PoseNetModule":
+        """The trained module, in evaluation mode, rebuilt from the file alone, without running any code of the file.
+
+        Raises:
+            CheckpointError: the file is missing, is no checkpoint of this project, or holds more than plain data.
+            UntrustedTargetError: it names classes that are not ours.
+        """
+        checkpoint = load_checkpoint(Path(checkpoint_path), map_location)
+        module = build({**checkpoint["hyper_parameters"], "_target_": checkpoint["module"]})
+        module.load_state_dict(checkpoint["state_dict"])
+        return module.to(map_location).eval()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Note the class, which Lightning leaves out."""
+        checkpoint["module"] = f"{type(self).__module__}.{type(self).__qualname__}"
+
+    @abstractmethod
+    def compute_loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
+        """The loss of the network's estimates on a batch of pairs."""
+
+    def forward(
+        self, reference: Float[Tensor, "batch 3 h w"], target: Float[Tensor, "batch 3 h w"]
+    ) -> Float[Tensor, "batch 6"]:
+        """Translation [m] and Euler angles [rad] of `T_ref_new` from two vertex maps [m], in float32."""
+        return self.model(reference, target).float()
+
+    @torch.no_grad()
+    def relative_pose(
+        self, reference: Float[Tensor, "batch 3 h w"], target: Float[Tensor, "batch 3 h w"]
+    ) -> Float[Tensor, "batch 4 4"]:
+        """`T_ref_new`, float64, from two vertex maps [m] made with `projection`."""
+        return se3.from_euler(self(reference, target).double())
+
+    def training_step(self, batch: Pair, batch_idx: int) -> Tensor:
+        """Loss of a batch; logs it and its parts."""
+        result = self._loss(self(batch["reference"], batch["target"]), batch)
+        values = {f"train/{name}": value for name, value in result.parts.items()}
+        # over all processes, so that the curve of a run does not depend on how many share it
+        self.log_dict(
+            {"train/loss": result.loss, **values}, batch_size=len(batch["reference"]), on_epoch=True, sync_dist=True
+        )
+        return result.loss
+
+    def on_validation_epoch_start(self) -> None:
+        """Forget the last epoch's predictions."""
+        self._predictions = [[] for _ in self.val_sequences]
+        self._val_losses = []
+
+    def validation_step(self, batch: Pair, batch_idx: int, dataloader_idx: int = 0) -> None:
+        """Predict the motions of a stretch of one sequence."""
+        parameters = self(batch["reference"], batch["target"])
+        self._val_losses.append(self._loss(parameters, batch).loss.detach())
+        self._predictions[dataloader_idx].append((torch.as_tensor(batch["index"]), parameters.detach()))
+
+    def on_validation_epoch_end(self) -> None:
+        """Chain the predictions into drives, score them, and log the error by which the best checkpoint is chosen.
+
+        `val/error` is the average translation error [%]; the mean relative translation error [m] where the drives are
+        under 100 m; the loss where they have no ground truth.
+        """
+        self.predicted_drives = [
+            predicted_drive(sequence, *self._gathered(predictions))
+            for sequence, predictions in zip(self.val_sequences, self._predictions, strict=True)
+        ]
+        means = mean_errors([e for e in map(drive_errors, self.predicted_drives) if e is not None])
+        loss = self.all_gather(torch.stack(self._val_losses).mean()).mean() if self._val_losses else torch.tensor(0.0)
+        error = means.get("avg_translation_error_percent", means.get("mean_relative_translation_error_m", float(loss)))
+        self.log_dict({f"val/{name}": value for name, value in means.items()}, rank_zero_only=True)
+        # every process needs the error, and has the same one: it decides about checkpoints together
+        self.log_dict({"val/loss": loss, "val/error": error})
+
+    @property
+    def val_sequences(self) -> list[Sequence]:
+        """The held-out sequences, in the order of the validation loaders."""
+        return self.trainer.datamodule.val_sequences  # type: ignore[attr-defined]
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        """Optimizer over the network and the loss (which may learn its weights), and the schedule of its rate."""
+        optimizer = build(self.hparams["optimizer"], params=self.parameters())
+        return {"optimizer": optimizer, "lr_scheduler": build(self.hparams["scheduler"], optimizer=optimizer)}
+
+    def _loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
+        """The loss in full precision: 16 bits resolve a point at 50 m to a quarter of a metre at best."""
+        with torch.autocast(self.device.type, enabled=False):
+            return self.compute_loss(parameters, batch)
+
+    def _gathered(self, predictions: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+        """Indices and parameters of a sequence's predictions, of all processes together."""
+        if not predictions:
+            return torch.zeros(0, dtype=torch.long), torch.zeros(0, 6)
+        indices = self.all_gather(torch.cat([index for index, _ in predictions]))
+        parameters = self.all_gather(torch.cat([values for _, values in predictions]))
+        return indices.reshape(-1), parameters.reshape(-1, 6)

@@ -1,0 +1,55 @@
+"""Parts of a training (model, loss, optimizer, scheduler) built from plain dicts, which a checkpoint can hold."""
+
+import importlib
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from lidarlearn.errors import UserError
+
+TRUSTED_PACKAGES = ("lidarlearn.", "torch.optim.", "torchvision.models.")
+
+
+class UntrustedTargetError(UserError):
+    """A dict names something to build that is none of this project's, or of torch's, parts."""
+
+
+def build(node: Mapping[str, Any], **arguments: Any) -> Any:
+    """An instance of the class that `_target_` names, with the dict's other keys as arguments.
+
+    The dict may come out of a checkpoint from anywhere, so it can name classes of `TRUSTED_PACKAGES` only, by the
+    module that defines them: nothing that these modules merely import, and no interpolations.
+
+    Args:
+        node: `_target_` and the constructor's arguments, plain values.
+        arguments: further arguments that only exist at run time, such as an optimizer's parameters.
+
+    Raises:
+        UntrustedTargetError: `_target_` is missing or names something else.
+        UserError: the arguments do not fit the constructor.
+    """
+    name = node.get("_target_")
+    target = _trusted_class(name)
+    merged = {**{str(key): value for key, value in node.items() if key != "_target_"}, **arguments}
+    try:
+        inspect.signature(target).bind(**merged)
+    except TypeError as error:
+        raise UserError(f"{name}: {error}\n  change: its keys are {_keys(target)}") from error
+    return target(**merged)
+
+
+def _trusted_class(name: object) -> type:
+    if not isinstance(name, str) or not name.startswith(TRUSTED_PACKAGES):
+        raise UntrustedTargetError(f"_target_ {name!r} is not built: only classes of {', '.join(TRUSTED_PACKAGES)}* are")
+    module_name, _, attribute = name.rpartition(".")
+    try:
+        target = getattr(importlib.import_module(module_name), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"_target_ {name!r} does not exist: {error}") from error
+    if not inspect.isclass(target) or not f"{target.__module__}.".startswith(TRUSTED_PACKAGES):
+        raise UntrustedTargetError(f"_target_ {name!r} is not built: it is no class of {', '.join(TRUSTED_PACKAGES)}*")
+    return target
+
+
+def _keys(target: type) -> str:
+    return ", ".join(name for name in inspect.signature(target).parameters if name != "self")

@@ -1,0 +1,106 @@
+"""The progress of a training, on a terminal and in a log file."""
+
+import sys
+import time
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks.progress import ProgressBar
+from torch import Tensor
+
+_BAR = 20  # characters
+
+
+class ProgressLines(ProgressBar):
+    """A bar with the loss and the time left, and one line per epoch that stays.
+
+    On a terminal the bar moves in place. Into a file or a pipe a line is written now and then, so that a log stays
+    readable.
+
+    Args:
+        seconds_between_lines: at least so long between two lines within an epoch, where output is no terminal [s].
+    """
+
+    def __init__(self, seconds_between_lines: float = 30.0) -> None:
+        super().__init__()
+        self.seconds_between_lines = seconds_between_lines
+        self._enabled = True
+        self._loss = float("nan")
+        self._epoch_started = self._fit_started = self._last_shown = 0.0
+        self._first_epoch = 0
+
+    def disable(self) -> None:
+        """Show nothing, as Lightning asks all processes but the first to."""
+        self._enabled = False
+
+    def enable(self) -> None:
+        """Show progress again."""
+        self._enabled = True
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self._fit_started = time.monotonic()
+        self._first_epoch = trainer.current_epoch
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the epoch's clock."""
+        self._epoch_started = self._last_shown = time.monotonic()
+        self._loss = float("nan")
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Move the bar."""
+        loss = float(outputs["loss"] if isinstance(outputs, dict) else outputs)
+        self._loss = loss if batch_idx == 0 else 0.95 * self._loss + 0.05 * loss
+        terminal = sys.stdout.isatty()
+        if time.monotonic() - self._last_shown >= (0.1 if terminal else self.seconds_between_lines):
+            self._last_shown = time.monotonic()
+            share = (batch_idx + 1) / max(1, trainer.num_training_batches)
+            self._show(f"{self._head(trainer, share)}  loss {self._loss:.4g}  {self._left(trainer, share)}", terminal)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave a line with the epoch's mean loss and, if it was validated, its error."""
+        metrics = trainer.callback_metrics
+        loss = float(metrics.get("train/loss_epoch", torch.tensor(self._loss)))
+        took = _duration(time.monotonic() - self._epoch_started)
+        parts = [self._head(trainer, 1.0), f"loss {loss:.4g}", *_errors(metrics), took, self._left(trainer, 1.0)]
+        self._show("  ".join(part for part in parts if part), in_place=False)
+
+    def _head(self, trainer: Trainer, share: float) -> str:
+        filled = round(_BAR * min(share, 1.0))
+        last = trainer.max_epochs if trainer.max_epochs and trainer.max_epochs > 0 else "?"
+        bar = "#" * filled + "-" * (_BAR - filled)
+        return f"epoch {trainer.current_epoch + 1:>{len(str(last))}}/{last} [{bar}] {100 * min(share, 1.0):3.0f} %"
+
+    def _left(self, trainer: Trainer, share: float) -> str:
+        """Time left, by the mean pace of this training."""
+        done = trainer.current_epoch - self._first_epoch + share
+        if not trainer.max_epochs or trainer.max_epochs < 0 or done <= 0:
+            return ""
+        left = (time.monotonic() - self._fit_started) / done * (trainer.max_epochs - self._first_epoch - done)
+        return f"{_duration(left)} left" if left > 0.5 else ""
+
+    def _show(self, text: str, in_place: bool) -> None:
+        if self._enabled:
+            start, end = ("\r\x1b[K", "" if in_place else "\n") if sys.stdout.isatty() else ("", "\n")
+            print(start + text, end=end, flush=True)
+
+
+def _errors(metrics: dict[str, Tensor]) -> list[str]:
+    """The validation errors that say most, with their units."""
+    shown = {
+        "val/avg_translation_error_percent": "avg translation error {:.2f} %",
+        "val/mean_relative_translation_error_percent": "relative translation error {:.1f} % of motion",
+        "val/mean_relative_translation_error_m": "= {:.3f} m",
+    }
+    return [form.format(float(metrics[name])) for name, form in shown.items() if name in metrics]
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"

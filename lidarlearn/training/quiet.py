@@ -1,0 +1,25 @@
+"""Which of Lightning's and torch's remarks are not for the user."""
+
+import logging
+import warnings
+
+# Each with the reason why it says nothing to someone who trains.
+_NOT_FOR_THE_USER = (
+    r".*does not have many workers.*",  # maps are mapped into memory: workers hardly help, and cores may be few
+    r".*is smaller than the logging interval.*",  # small data sets are legitimate; epoch values are logged anyway
+    r".*Checkpoint directory .* exists and is not empty.*",  # resuming into the same run folder is legitimate
+    r".*You're resuming from a checkpoint that ended before the epoch ended.*",  # checkpoints are of whole epochs
+    r".*`isinstance\(treespec, LeafSpec\)` is deprecated.*",  # Lightning's own use of torch
+    r".*LeafSpec.*deprecated.*",  # likewise
+    r".*Consider setting `persistent_workers=True`.*",  # they are, where there are workers
+    r".*The dirpath has changed from.*",  # a run that resumes has a new folder, its best score starts anew
+    r".*Detected call of `lr_scheduler.step\(\)` before `optimizer.step\(\)`.*",  # 16 bits skip overflowing first steps
+)
+
+
+def quiet() -> None:
+    """Hide hardware banners, tips and warnings about legitimate choices; whatever else is said stays."""
+    for name in ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in _NOT_FOR_THE_USER:
+        warnings.filterwarnings("ignore", message=message)

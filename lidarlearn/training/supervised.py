@@ -1,0 +1,31 @@
+"""Training from ground truth."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.data.pairs import Pair
+from lidarlearn.errors import UserError
+from lidarlearn.losses.result import LossResult
+from lidarlearn.training.module import PoseNetModule
+
+
+class SupervisedModule(PoseNetModule):
+    """PoseNet trained by the distance of its estimates to the true relative poses.
+
+    Args: see `PoseNetModule`; the loss is the supervised one.
+
+    Source: Dellenbach et al. 2021, III-B "Supervised training".
+    """
+
+    def compute_loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
+        """Distance to ground truth.
+
+        Raises:
+            UserError: a sequence has none.
+        """
+        if "T_ref_new" not in batch:
+            raise UserError(
+                "loss=supervised needs ground truth, and not all of the training and validation sequences have it.\n"
+                "  change: data.train_sequences and data.val_sequences to those that do, or loss=weighted_icp"
+            )
+        return self.loss(parameters, batch["T_ref_new"])

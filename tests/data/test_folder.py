@@ -1,0 +1,159 @@
+import numpy as np
+import pytest
+import torch
+
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.folder import Folder, relative_times
+from lidarlearn.errors import UserError
+from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.test_pose_files import tum_rows
+from tests.data.writers import curve, kitti_rows, random_points, write_float32, write_pcd
+
+TIMES = np.linspace(0, 99_000_000, 200).astype(np.uint32)
+
+
+def folder(root, **settings):
+    return Folder(root, SphericalProjection(), **settings)
+
+
+def write_scans(directory, names=("1.bin", "2.bin", "10.bin")):
+    for i, name in enumerate(names):
+        write_float32(directory / name, random_points(i))
+
+
+def details(report, level):
+    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
+
+
+def test_every_subfolder_is_a_sequence(tmp_path):
+    for name in ("run_10", "run_9"):
+        write_scans(tmp_path / name)
+    (tmp_path / "notes").mkdir()
+    data = folder(tmp_path)
+    assert data.train_sequences == data.val_sequences == data.test_sequences == ("run_9", "run_10")
+    assert folder(tmp_path, test_sequences=["run_9"]).test_sequences == ("run_9",)
+    assert len(data.sequence("run_9")) == 3
+
+
+def test_the_folder_itself_is_a_sequence_in_natural_order(tmp_path):
+    write_scans(tmp_path / "drive")
+    data = folder(tmp_path / "drive")
+    assert data.test_sequences == ("drive",)
+    sequence = data.sequence("drive")
+    assert sequence.scans.names == ("1.bin", "2.bin", "10.bin")
+    for i, scan in enumerate(sequence):
+        assert np.array_equal(scan.points, random_points(i))
+        assert scan.times is None and scan.intensities is None
+    assert sequence.T_world_lidar is None and sequence.timestamps is None
+
+
+def test_point_times_and_intensities(tmp_path):
+    (tmp_path / "drive").mkdir()
+    write_pcd(tmp_path / "drive" / "0.pcd", random_points(0), TIMES)
+    scan = folder(tmp_path, max_intensity=200).sequence("drive").scan(0)
+    assert scan.times is not None and np.allclose(scan.times, np.linspace(-0.5, 0.5, 200), atol=1e-6)
+    assert scan.intensities is not None and (scan.intensities == 0.5).all()
+
+
+def test_relative_times_of_any_unit():
+    expected = torch.tensor([-0.5, 0.0, 0.5])
+    for times in ([0.0, 50.0, 100.0], [1.6e9, 1.6e9 + 0.05, 1.6e9 + 0.1]):
+        assert torch.allclose(relative_times(torch.tensor(times, dtype=torch.float64)), expected, atol=1e-5)
+    assert torch.equal(relative_times(torch.ones(3).double()), torch.zeros(3))
+
+
+@pytest.mark.parametrize("name", ["drive/poses.txt", "drive/groundtruth.txt", "drive.txt"])
+def test_kitti_ground_truth(tmp_path, name):
+    write_scans(tmp_path / "drive")
+    (tmp_path / name).write_text(kitti_rows(curve(5)[2:]))
+    expected = np.linalg.inv(curve(3)[2]) @ curve(5)[2:]
+    assert np.allclose(folder(tmp_path).sequence("drive").T_world_lidar, expected, atol=1e-9)
+    cut = folder(tmp_path, max_frames=2).sequence("drive")
+    assert len(cut) == len(cut.T_world_lidar) == 2
+
+
+def test_tum_ground_truth_by_time(tmp_path):
+    write_scans(tmp_path / "drive")
+    (tmp_path / "drive.tum").write_text(tum_rows(curve(6), 0.2 * np.arange(6)))
+    (tmp_path / "drive" / "times.txt").write_text("0.2\n0.5\n0.8\n")
+    sequence = folder(tmp_path).sequence("drive")
+    two_steps = np.linalg.inv(curve(3)[1]) @ curve(5)[4]  # from 0.2 s to 0.8 s
+    assert np.allclose(sequence.T_world_lidar[2], two_steps, atol=1e-8)
+    half = sequence.T_world_lidar[1].numpy()
+    assert np.allclose(half @ half, two_steps, atol=1e-8)
+    assert sequence.timestamps.tolist() == [0.2, 0.5, 0.8]
+
+
+def test_tum_ground_truth_in_order_where_scans_have_no_times(tmp_path):
+    write_scans(tmp_path / "drive")
+    (tmp_path / "drive" / "poses.tum").write_text(tum_rows(curve(3), [5.0, 6.0, 7.0]))
+    assert np.allclose(folder(tmp_path).sequence("drive").T_world_lidar, curve(3), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "problem"),
+    [
+        ("poses.txt", kitti_rows(curve(2)), "2 poses for 3 scans"),
+        ("poses.txt", "", "empty"),
+        ("poses.txt", "1 2 3\n" * 3, "3 numbers"),
+        ("times.txt", "0\n1\n", "2 times for 3 scans"),
+        ("times.txt", "", "empty"),
+    ],
+)
+def test_damaged_ground_truth_and_times(tmp_path, file, content, problem):
+    write_scans(tmp_path / "drive")
+    (tmp_path / "drive" / file).write_text(content)
+    with pytest.raises(DamagedFileError, match=problem):
+        folder(tmp_path).sequence("drive")
+
+
+def test_clocks_that_do_not_agree(tmp_path):
+    write_scans(tmp_path / "drive")
+    (tmp_path / "drive" / "poses.tum").write_text(tum_rows(curve(3), [5.0, 6.0, 7.0]))
+    (tmp_path / "drive" / "times.txt").write_text("0.2\n0.5\n0.8\n")
+    with pytest.raises(DamagedFileError, match="do not cover"):
+        folder(tmp_path).sequence("drive")
+
+
+def test_scans_of_several_kinds(tmp_path):
+    write_scans(tmp_path / "drive")
+    write_pcd(tmp_path / "drive" / "0.pcd", random_points(0), TIMES)
+    with pytest.raises(UserError, match="several kinds"):
+        folder(tmp_path).sequence("drive")
+    assert not folder(tmp_path).check().usable
+
+
+def test_missing_scans(tmp_path):
+    with pytest.raises(DataSetNotFoundError, match=r"data\.root"):
+        folder(tmp_path / "nowhere").sequence("nowhere")
+    assert not folder(tmp_path / "nowhere").check().usable
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    write_scans(tmp_path / "deep" / "er" / "drive")
+    assert folder(tmp_path).check().remedy == f"data.root={tmp_path / 'deep' / 'er'}"
+
+
+def test_check(tmp_path):
+    write_scans(tmp_path / "drive")
+    report = folder(tmp_path).check()
+    assert report.usable and "no ground truth" in details(report, "odd")
+    (tmp_path / "drive.txt").write_text(kitti_rows(curve(3)))
+    assert "with 3 rows" in details(folder(tmp_path).check(), "found")
+    (tmp_path / "drive" / "2.bin").write_bytes(b"x" * 17)
+    report = folder(tmp_path).check()
+    assert not report.usable and "2.bin (17 bytes)" in details(report, "missing")
+
+
+def test_fingerprint_follows_the_settings(tmp_path):
+    write_scans(tmp_path / "drive")
+    settings = ({}, {"beam_correction_deg": 0.1}, {"bin_columns": 5}, {"max_intensity": 255})
+    assert len({folder(tmp_path, **s).sequence("drive").fingerprint for s in settings}) == 4
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(("name", "count"), [("ouster_mcd", 3), ("hdl32_pair", 2)])
+def test_genuine_folders(real_data, name, count):
+    data = folder(real_data / name)
+    sequence = data.sequence(name)
+    assert len(sequence) == count
+    assert all(len(scan.points) > 60_000 and scan.points.isfinite().all() for scan in sequence)
+    assert data.check().usable

@@ -1,0 +1,155 @@
+import numpy as np
+import pytest
+import torch
+
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.kitti_raw import ODOMETRY_DRIVES, KittiRaw, sweep_times
+from lidarlearn.data.oxts import mercator
+from lidarlearn.geometry import se3
+from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.writers import write_kitti_raw
+
+DRIVE = "2011_09_26_drive_0009"
+
+
+def raw(root, name=DRIVE, **settings):
+    return KittiRaw(root, SphericalProjection(), [name], [name], [name], **settings)
+
+
+def folder(root):
+    return root / "2011_09_26" / f"{DRIVE}_sync"
+
+
+def details(report, level):
+    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
+
+
+def test_round_trip(tmp_path):
+    written = write_kitti_raw(tmp_path)
+    sequence = raw(tmp_path, beam_correction_deg=0).sequence(DRIVE)
+    assert len(sequence) == 6
+    for scan, points in zip(sequence, written.points, strict=True):
+        assert torch.equal(scan.points, torch.from_numpy(points))
+        assert scan.intensities is not None and (scan.intensities == 0.5).all()
+    assert torch.equal(sequence.T_world_lidar[0], torch.eye(4).double())
+    assert np.allclose(sequence.timestamps - sequence.timestamps[0], 0.1 * np.arange(6), atol=1e-6)
+    assert sequence.reference_frame == "lidar"
+    assert raw(tmp_path).deskew
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.015, -0.02])
+def test_poses_are_those_of_the_middle_of_the_sweep_whenever_the_packets_came(tmp_path, lag):
+    written = write_kitti_raw(tmp_path, lag=lag)
+    T = raw(tmp_path).sequence(DRIVE).T_world_lidar
+    assert np.allclose(T, written.T_world_lidar, atol=1e-4)  # Mercator's scale changes along the way
+
+
+def test_dropped_scans_keep_their_numbers(tmp_path, caplog):
+    written = write_kitti_raw(tmp_path, dropped=(2, 3))
+    sequence = raw(tmp_path).sequence(DRIVE)
+    assert len(sequence) == 4 and "1 gaps" in caplog.text
+    assert np.allclose(sequence.T_world_lidar, written.T_world_lidar, atol=1e-4)
+    report = raw(tmp_path).check()
+    assert report.usable and "gaps in the numbering: 2-3" in details(report, "odd")
+
+
+def test_sweep_times_run_clockwise_from_the_rear():
+    forward, right, left = [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]
+    rear_left, rear_right = [-1.0, 1e-6, 0.0], [-1.0, -1e-6, 0.0]
+    times = sweep_times(torch.tensor([rear_left, left, forward, right, rear_right]))
+    assert torch.allclose(times, torch.tensor([-0.5, -0.25, 0.0, 0.25, 0.5]), atol=1e-6)
+
+
+def test_odometry_numbers_select_the_part_of_the_drive(tmp_path):
+    drive = ODOMETRY_DRIVES["08"]
+    write_kitti_raw(tmp_path, drive=drive.name, frames=4)
+    scans = tmp_path / drive.name[:10] / f"{drive.name}_sync" / "velodyne_points" / "data"
+    (scans / "0000000003.bin").rename(scans / "0000001100.bin")
+    data = raw(tmp_path, name="08")
+    stamps = tmp_path / drive.name[:10] / f"{drive.name}_sync" / "velodyne_points"
+    for end in ("start", "end"):
+        lines = (stamps / f"timestamps_{end}.txt").read_text().splitlines()
+        (stamps / f"timestamps_{end}.txt").write_text("\n".join(lines[:3] + [""] * 1097 + lines[3:]) + "\n")
+    assert data.sequence("08").scans.names == ("0000001100.bin",)
+    assert len(data.sequence(drive.name)) == 4
+
+
+def test_mercator_is_true_to_scale_at_the_first_latitude():
+    position = mercator(np.array([49.0, 49.0001, 49.0]), np.array([8.4, 8.4, 8.4001]), np.array([100.0, 100.0, 101.0]))
+    north, east = position[1] - position[0], position[2] - position[0]
+    assert north == pytest.approx([0, np.radians(1e-4) * 6378137, 0], abs=1e-3)
+    assert east == pytest.approx([np.radians(1e-4) * 6378137 * np.cos(np.radians(49)), 0, 1], abs=1e-3)
+
+
+def test_without_gps_there_is_no_ground_truth(tmp_path):
+    write_kitti_raw(tmp_path)
+    (folder(tmp_path) / "oxts").rename(tmp_path / "elsewhere")
+    assert raw(tmp_path).sequence(DRIVE).T_world_lidar is None
+    report = raw(tmp_path).check()
+    assert not report.usable and "no ground truth" in details(report, "missing")
+
+
+@pytest.mark.parametrize(
+    "gone",
+    [
+        "calib_imu_to_velo.txt",
+        f"{DRIVE}_sync/velodyne_points/timestamps_start.txt",
+        f"{DRIVE}_sync/oxts/timestamps.txt",
+        f"{DRIVE}_sync/velodyne_points/data",
+        f"{DRIVE}_sync",
+    ],
+)
+def test_missing_parts_are_named(tmp_path, gone):
+    write_kitti_raw(tmp_path)
+    (tmp_path / "2011_09_26" / gone).rename(tmp_path / "elsewhere")
+    with pytest.raises(DataSetNotFoundError, match=r"KITTI raw[\s\S]*data\.root"):
+        raw(tmp_path).sequence(DRIVE)
+    assert not raw(tmp_path).check().usable
+
+
+@pytest.mark.parametrize("level", ["root/2011_09_26", "."])
+def test_the_right_level_is_suggested(tmp_path, level):
+    write_kitti_raw(tmp_path / "root")
+    assert raw(tmp_path / level).check().remedy == f"data.root={tmp_path / 'root'}"
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "problem"),
+    [
+        ("oxts/data/0000000002.txt", "", "empty"),
+        ("oxts/data/0000000002.txt", "1 2 3\n", "3 numbers"),
+        ("oxts/data/0000000002.txt", "nan " * 30 + "\n", "not finite"),
+        ("velodyne_points/timestamps_start.txt", "2011-09-26 13:08:24.9\n", "1 rows, too few for frame 5"),
+        ("velodyne_points/timestamps_end.txt", "2011-09-26 13:08:24.9\n\n\n\n\n\n\n", "row 2 is blank"),
+        ("velodyne_points/timestamps_end.txt", "yesterday\n" * 6, "not a date"),
+        ("oxts/timestamps.txt", "2011-09-26 13:08:24.9\n" * 6, "ascend"),
+        ("oxts/timestamps.txt", "".join(f"2012-09-26 13:08:2{i}\n" for i in range(6)), "overlap"),
+        ("../calib_imu_to_velo.txt", "R: 1 2\nT: 1\n", "nine"),
+    ],
+)
+def test_damaged_files(tmp_path, file, content, problem):
+    write_kitti_raw(tmp_path)
+    (folder(tmp_path) / file).write_text(content)
+    with pytest.raises(DamagedFileError, match=problem):
+        raw(tmp_path).sequence(DRIVE)
+
+
+def test_a_truncated_scan(tmp_path):
+    write_kitti_raw(tmp_path)
+    path = folder(tmp_path) / "velodyne_points/data/0000000001.bin"
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(DamagedFileError, match="0000000001"):
+        raw(tmp_path).sequence(DRIVE).scan(1)
+    assert not raw(tmp_path).check().usable
+
+
+@pytest.mark.realdata
+def test_genuine_drive_0009(real_data):
+    sequence = raw(real_data / "kitti_raw").sequence(DRIVE)
+    assert len(sequence) == 31
+    steps = se3.relative(sequence.T_world_lidar)
+    assert steps[:, :3, 3].norm(dim=1).median() == pytest.approx(1.1, abs=0.05)
+    assert (steps[:, 0, 3] > 0.9).all() and steps[:, 1, 3].abs().max() < 0.1  # forward
+    times = sequence.scan(10).times
+    assert times is not None and times.min() >= -0.5 and times.max() <= 0.5
+    assert raw(real_data / "kitti_raw").check().usable

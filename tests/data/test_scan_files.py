@@ -1,0 +1,76 @@
+import numpy as np
+import pytest
+
+from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.scan_files import gaps, list_scans, natural_key, read_float32_rows, sequence_names
+from tests.data.writers import random_points, write_float32
+
+
+def test_scans_come_in_natural_order(tmp_path):
+    for name in ("scan_10.bin", "scan_9.bin", "scan_100.bin", ".scan_1.bin", "notes.txt"):
+        (tmp_path / name).write_bytes(b"x" * 16)
+    scans = list_scans(tmp_path, (".bin",))
+    assert scans.names == ("scan_9.bin", "scan_10.bin", "scan_100.bin")
+    assert scans.numbers == [9, 10, 100]
+    assert scans.first(2).names == ("scan_9.bin", "scan_10.bin")
+
+
+def test_an_absent_folder_holds_no_scans(tmp_path):
+    assert len(list_scans(tmp_path / "nowhere", (".bin",))) == 0
+
+
+def test_natural_key_orders_by_value_then_by_text():
+    assert sorted(["b2", "a10", "a9", "a09"], key=natural_key) == ["a09", "a9", "a10", "b2"]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [(["09", 10], ("09", "10")), (4, ("04",)), ("08", ("08",)), ([], ())],
+)
+def test_numbers_from_the_command_line_get_their_zeros_back(given, expected):
+    assert sequence_names(given, digits=2) == expected
+
+
+def test_gaps():
+    assert gaps([3, 4, 7, 9]) == [(5, 6), (8, 8)]
+    assert gaps([5, 6, 7]) == []
+
+
+def test_fingerprint_follows_files_and_settings_but_not_the_place(tmp_path):
+    for folder in ("a", "b"):
+        write_float32(tmp_path / folder / "0.bin", random_points(0))
+    a, b = (list_scans(tmp_path / folder, (".bin",)) for folder in ("a", "b"))
+    assert a.fingerprint("R", angle=1.0) == b.fingerprint("R", angle=1.0)
+    assert a.fingerprint("R", angle=1.0) != a.fingerprint("R", angle=2.0)
+    assert a.fingerprint("R", angle=1.0) != a.fingerprint("S", angle=1.0)
+    write_float32(tmp_path / "b" / "0.bin", random_points(0)[:-1])
+    assert a.fingerprint("R") != list_scans(tmp_path / "b", (".bin",)).fingerprint("R")
+
+
+def test_rows_are_read_as_written(tmp_path):
+    points = random_points(0)
+    write_float32(tmp_path / "0.bin", points, columns=5)
+    rows = read_float32_rows(tmp_path / "0.bin", columns=5)
+    assert np.array_equal(rows[:, :3], points)
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"", "empty"),
+        (b"\0" * 37, "truncated"),
+        (np.array([1, 2, np.nan, 0], "<f4").tobytes(), "1 of 1 points are not finite"),
+        (np.array([1, np.inf, 2, 0], "<f4").tobytes(), "not finite"),
+    ],
+)
+def test_damaged_rows_name_the_file(tmp_path, content, problem):
+    path = tmp_path / "000007.bin"
+    path.write_bytes(content)
+    with pytest.raises(DamagedFileError, match=problem) as caught:
+        read_float32_rows(path, columns=4)
+    assert "000007.bin" in str(caught.value)
+
+
+def test_a_file_that_vanished_is_damage(tmp_path):
+    with pytest.raises(DamagedFileError, match="cannot be read"):
+        read_float32_rows(tmp_path / "gone.bin", columns=4)

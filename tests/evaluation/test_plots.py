@@ -1,0 +1,104 @@
+import pytest
+import torch
+
+from lidarlearn.evaluation.plots import (
+    drift_figure,
+    figures,
+    frame_error_figure,
+    speed_figure,
+    trajectory_figure,
+    write_plots,
+)
+from lidarlearn.evaluation.score import score
+from lidarlearn.geometry import se3
+from lidarlearn.metrics.kitti import SegmentAverage
+
+
+def legend(axes_or_figure):
+    return [text.get_text() for text in axes_or_figure.get_legend().get_texts()]
+
+
+def test_trajectories_start_together_to_the_same_scale(make_drive, longer):
+    truth = make_drive(80)
+    elsewhere = se3.exp(torch.tensor([50.0, 7, 1, 0.1, 0.2, 2.0], dtype=torch.float64)) @ truth
+    figure = trajectory_figure("a", truth, {"same": elsewhere, "longer": longer(truth, 0.1)})
+    (axes,) = figure.axes
+    assert axes.get_aspect() == 1
+    assert legend(axes) == ["ground truth", "same", "longer", "start"]
+    assert "[m]" in axes.get_xlabel()
+    assert "[m]" in axes.get_ylabel()
+    true, same, far, _ = (torch.tensor(line.get_xydata()) for line in axes.lines)
+    assert torch.allclose(true, truth[:, :2, 3])
+    assert torch.allclose(same, true, atol=1e-9)
+    assert far[-1, 0] > true[-1, 0]
+
+
+def test_a_runaway_does_not_hide_the_rest(make_drive, longer):
+    truth = make_drive(60)
+    (axes,) = trajectory_figure("a", truth, {"runaway": longer(truth, 1000.0)}).axes
+    assert axes.get_xlim()[1] < 3 * float(truth[:, 0, 3].max())
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_trajectories_of_hardly_any_pose(make_drive, frames):
+    T = make_drive(frames)
+    (axes,) = trajectory_figure("a", None, {"m": T}).axes
+    assert legend(axes) == ["m", "start"]
+    assert axes.get_xlim()[0] < axes.get_xlim()[1]
+
+
+def test_drift_over_length():
+    averages = {"m": {100: SegmentAverage(3, 1.5, 0.4), 200: SegmentAverage(1, 1.0, 0.3)}}
+    left, right = drift_figure("a", averages).axes
+    assert left.lines[0].get_xydata().tolist() == [[100, 1.5], [200, 1.0]]
+    assert right.lines[0].get_ydata().tolist() == [0.4, 0.3]
+    assert (left.get_ylabel(), right.get_ylabel()) == ("translation error [%]", "rotation error [deg/100 m]")
+
+
+def test_speed_distribution_sums_to_all_scans():
+    true = torch.linspace(0, 50, 200, dtype=torch.float64)
+    outlier = torch.cat([true, torch.tensor([900.0], dtype=torch.float64)])
+    (axes,) = speed_figure("a", true, {"m": outlier}).axes
+    assert sum(bar.get_height() for bar in axes.patches if hasattr(bar, "get_height")) == pytest.approx(100)
+    assert axes.get_xlim()[1] < 100  # one mistake does not squeeze the picture
+    assert "the last bin holds all beyond" in axes.get_xlabel()
+    assert "km/h" in axes.get_ylabel()
+
+
+def test_frame_errors_mark_failures(make_drive, longer):
+    truth = make_drive(40)
+    upper, lower = frame_error_figure("a", truth, {"m": longer(truth, 0.1)}).axes
+    assert upper.get_yscale() == lower.get_yscale() == "log"
+    assert [axes.lines[-1].get_ydata()[0] for axes in (upper, lower)] == [1.0, 3.0]
+    assert upper.lines[0].get_ydata().tolist() == pytest.approx([0.1] * 39, rel=1e-3)
+    assert lower.get_xlabel() == "scan"
+
+
+def test_methods_look_different_and_keep_their_look(make_drive):
+    T = make_drive(20)
+    methods = {f"m{i}": T for i in range(12)}
+    (axes,) = trajectory_figure("a", None, methods).axes
+    looks = [(line.get_color(), line.get_linestyle()) for line in axes.lines[:12]]
+    assert len(set(looks)) == 12
+    errors = frame_error_figure("a", T, methods).axes[0]
+    assert [(line.get_color(), line.get_linestyle()) for line in errors.lines[:12]] == looks
+
+
+def test_all_figures_of_an_evaluation_become_files(tmp_path, make_sequence, longer, unknown_drive):
+    sequences = {"a": make_sequence("a", 150), "unknown": unknown_drive}
+    estimates = {"m": {"a": longer(sequences["a"].T_world_lidar, 0.02), "unknown": se3.identity(5)}}
+    scores = [score("m", T, sequences[name]) for name, T in estimates["m"].items()]
+    paths = write_plots(tmp_path / "plots", figures(sequences, estimates, scores))
+    assert sorted(path.name for path in paths) == [
+        "error_over_distance.png",
+        "frame_errors_a.png",
+        "speed_distribution.png",
+        "trajectories_a.png",
+        "trajectories_unknown.png",
+    ]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
+
+
+def test_what_cannot_be_drawn_is_left_out(unknown_drive):
+    drawn = dict(figures({"unknown": unknown_drive}, {"m": {"unknown": se3.identity(5)}}, []))
+    assert list(drawn) == ["trajectories_unknown"]
