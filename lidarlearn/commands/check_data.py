@@ -66,9 +66,7 @@ def show(report: LayoutReport, console: Console) -> None:
     else:
         missing = sum(finding.level == "missing" for finding in report.findings)
         remedy = report.remedy or "mend what is listed as missing"
-        console.print(
-            Text(f"NOT usable as configured ({missing} missing). change: {remedy}", style="bold")
-        )
+        console.print(Text(f"NOT usable as configured ({missing} missing). change: {remedy}", style="bold"))
 
 
 def _message(error: Exception) -> str:

@@ -19,7 +19,7 @@ _FULL_ERROR = "HYDRA_FULL_ERROR"
 _SETTINGS_AT_FAULT = (UserError, TypeError, ValueError, ImportError, MisconfigurationException)
 
 
-def run(task: Callable[[DictConfig], None], config_name: str) -> None:
+def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[[], None] = lambda: None) -> None:
     """Compose the configuration from the command line and run the task with it, once or for every job of a multirun.
 
     What the user can mend is printed as one message, and the process exits with 1: a `UserError`, a typo in a group or
@@ -29,8 +29,10 @@ def run(task: Callable[[DictConfig], None], config_name: str) -> None:
     Args:
         task: takes the composed configuration.
         config_name: of the primary config in `configs/`.
+        prepare: called before the configuration is composed, e.g. to complete the command line.
     """
     if os.environ.get(_FULL_ERROR) == "1":
+        prepare()
         _application(task, config_name)()
         return
 
@@ -43,6 +45,7 @@ def run(task: Callable[[DictConfig], None], config_name: str) -> None:
 
     os.environ[_FULL_ERROR] = "1"  # Hydra hands its errors on instead of printing them in its own way
     try:
+        prepare()
         _application(task_with_readable_errors, config_name)()
     except Exception as error:
         _exit_if_readable(error)

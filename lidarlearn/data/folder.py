@@ -131,6 +131,8 @@ class Folder(DataSet):
             raise UserError(
                 f"{folder}: scans of several kinds ({', '.join(kinds)}).\n  change: keep one kind in a folder"
             )
+        if self.deskew and read_cloud(files.path(0), self.bin_columns).times is None:
+            raise UserError(f"{files.path(0)}: no point times to deskew with.\n  change: data.deskew=false")
         timestamps = _timestamps(folder, len(files))
         poses = self._ground_truth(folder, len(files), timestamps)
         scans = files.first(self.max_frames)

@@ -120,6 +120,10 @@ class SimulatedDataSet(DataSet):
         beam_correction_deg: float = 0.0,
         workers: int | None = None,
     ) -> None:
+        if beam_correction_deg != 0:
+            raise ValueError(
+                f"simulated beams need no correction: beam_correction_deg must be 0, got {beam_correction_deg}"
+            )
         self.root, self.projection, self.world, self.sensor = Path(root), projection, world, sensor
         self.title = f"simulated {world}"
         self.train_sequences, self.val_sequences = tuple(train_sequences), tuple(val_sequences)

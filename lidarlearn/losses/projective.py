@@ -24,13 +24,19 @@ class ProjectiveLoss(nn.Module, ABC):
 
     Args:
         normal_window: rows and columns of the neighbourhood of reference normals [px], odd.
+        max_range_jump: see `normal_map`; the fewer rows an image has, the larger the steps between them.
+        max_roughness: see `normal_map`.
 
     Source: Dellenbach et al. 2021, III-B "Unsupervised training".
     """
 
-    def __init__(self, normal_window: tuple[int, int] = (3, 5)) -> None:
+    def __init__(
+        self, normal_window: tuple[int, int] = (3, 3), max_range_jump: float = 0.05, max_roughness: float = 0.5
+    ) -> None:
         super().__init__()
         self.normal_window = (int(normal_window[0]), int(normal_window[1]))
+        self.max_range_jump = max_range_jump
+        self.max_roughness = max_roughness
 
     @abstractmethod
     def rho(
@@ -60,7 +66,7 @@ class ProjectiveLoss(nn.Module, ABC):
         """
         aligned = reproject(se3.from_euler(parameters), target, projection)
         with torch.no_grad():
-            normals = normal_map(reference, window=self.normal_window)
+            normals = normal_map(reference, self.normal_window, self.max_range_jump, self.max_roughness)
             used = activated(reference) & activated(aligned) & activated(normals)
         offsets = aligned - reference
         residuals = (offsets * normals).sum(dim=1)

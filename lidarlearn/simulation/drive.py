@@ -120,7 +120,8 @@ class Drive(Sequence):
         if self._given is not None:
             times = period * np.arange(len(self._given))
             feet = self._given[:, :3, 3] - self._place.vehicle.sensor_height * self._given[:, :3, 2]
-            return Trajectory(times, self._given), GroundBelow(feet), extended(feet[:, :2], 100.0)
+            track = extended(feet, 100.0)
+            return Trajectory(times, self._given), GroundBelow(track), track[:, :2]
         terrain = Hills(self._chance(_TERRAIN), self._place.slope_deg)
         rng, start, duration = self._chance(_MOTION), -2 * period, (self.frames + 3) * period
         if self._place.driving is None:

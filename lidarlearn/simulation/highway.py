@@ -14,12 +14,12 @@ def furnish_highway(site: Site) -> None:
     for side in (-1, 1):
         _rails(site, road, side * (road.half_width + 0.9), share=0.35)
         _barriers(site, road, side)
-        for spot in site.spots(road, side, 0.7, (48, 52)):
+        for spot in site.spots(road, side, 0.7, (48.0, 52.0)):
             site.place(objects.bollard(site.rng), spot.xy, 0.0, (0.3, 0.3), 0.2)
-        for spot in site.spots(road, side, 3.0, (60, 220)):
+        for spot in site.spots(road, side, 3.0, (60.0, 220.0)):
             toward = spot.along if side < 0 else spot.along + np.pi
             site.place(objects.road_sign(site.rng), spot.xy, toward, (0.6, 4.0), 0.8)
-        for spot in site.spots(road, side, 1.8, (70, 180)):
+        for spot in site.spots(road, side, 1.8, (70.0, 180.0)):
             site.place(objects.lamp(site.rng), spot.xy, spot.facing, (0.5, 0.5), 0.8)
     _across(site, road)
     _woods(site)
@@ -64,7 +64,7 @@ def _across(site: Site, road: Street) -> None:
             span, width, clear = 2 * road.half_width + 16, rng.uniform(6, 12), rng.uniform(5.0, 6.0)
             deck = box(width, span, 1.2, base=clear)
             parapets = [objects.at(box(0.25, span, 1.0, base=clear + 1.2), x=x) for x in (-width / 2, width / 2)]
-            ends = [objects.at(box(width, 3.0, clear + 1, base=-1), y=side * (span / 2 - 1.5)) for side in (-1, 1)]
+            ends = [objects.at(box(width, 3.0, clear + 1, base=-1.0), y=side * (span / 2 - 1.5)) for side in (-1, 1)]
             piers = [objects.at(box(1.0, 0.8, clear), x=x) for x in (-width / 3, width / 3)]
             site.add(merge([deck, *parapets, *ends, *piers]), road.centreline[k], yaw + rng.uniform(-0.2, 0.2))
         else:

@@ -53,7 +53,7 @@ def _wheel_positions(length: float, width: float) -> np.ndarray:
 def pedestrian(rng: np.random.Generator) -> Mesh:
     """A person in mid-stride."""
     height = rng.uniform(1.55, 1.9)
-    stride = rng.uniform(0.1, 0.3)
+    stride = rng.uniform(0.03, 0.2)
     legs = [at(cylinder(0.09, 0.48 * height, 6), x=sign * stride, y=sign * 0.1) for sign in (-1, 1)]
     torso = cylinder(0.17, 0.38 * height, 6, top_radius=0.24, base=0.46 * height)
     head = cylinder(0.1, 0.14 * height, 6, base=0.86 * height)

@@ -59,7 +59,9 @@ def street(seed: int = 0, length: float = 200.0) -> World:
         while x < length - 50:
             size = rng.uniform(9, 18)
             front = 0.0 if side > 0 else np.pi
-            parts.append(objects.at(building(rng, size, 9, rng.uniform(4, 10)), x + size / 2, side * 14.5, 0.0, front))
+            parts.append(
+                objects.at(building(rng, size, 9.0, rng.uniform(4, 10)), x + size / 2, side * 14.5, 0.0, front)
+            )
             parts.append(objects.at(objects.tree(rng), x + rng.uniform(0, size), side * 6.5))
             parts.append(objects.at(objects.lamp(rng), x + rng.uniform(0, size), side * 5.5, 0.0, -side * np.pi / 2))
             parts.append(objects.at(objects.car(rng), x + rng.uniform(0, size), side * 4.5))

@@ -66,7 +66,7 @@ class Sensor:
         return math.pi - 2 * math.pi * (np.arange(self.columns) + shift) / self.columns
 
     def directions(
-        self, index: int, R_world_column: Float[np.ndarray, "columns 3 3"] | None = None
+        self, index: int, R_world_column: Float[np.ndarray, "#columns 3 3"] | None = None
     ) -> Float[np.ndarray, "beams columns 3"]:
         """Unit vectors of the rays of scan `index`, in the sensor frame or, given rotations, in the world frame."""
         azimuths = self.azimuths(index)
@@ -94,12 +94,11 @@ class Sensor:
         """
         noise = rng.standard_normal(distances.shape, dtype=np.float32)
         chance = rng.random(distances.shape, dtype=np.float32)
-        ranges = distances + np.float32(self.range_noise) * noise
-        # chance < drop_out + (1 - drop_out) / (1 + signal), without the divisions
-        keep = (ranges >= self.min_range) & (ranges <= self.max_range)
-        lost = np.float32(self.drop_out)
-        fading = distances * distances
-        fading *= np.float32(1 / self.reach**2)
+        keep = np.isfinite(distances)
+        ranges = np.where(keep, distances, 0) + np.float32(self.range_noise) * noise
+        keep &= (ranges >= self.min_range) & (ranges <= self.max_range)
+        lost, fading = np.float32(self.drop_out), ranges * ranges * np.float32(1 / self.reach**2)
+        # chance >= drop_out + (1 - drop_out) / (1 + signal) with signal = cos_incidence / fading, undivided
         keep &= (chance - lost) * (cos_incidence + fading) >= np.float32(1 - self.drop_out) * fading
         steps = np.where(keep, ranges, 0) * np.float32(1 / RANGE_STEP) + np.float32(0.5)
         return steps.astype(np.uint16)

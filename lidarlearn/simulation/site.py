@@ -184,7 +184,7 @@ class Site:
         x, y = (np.linspace(-extent / 2, extent / 2, int(extent / self._CELL) + 2) for extent in size)
         x, y = (axis.ravel() for axis in np.meshgrid(x, y))
         turned = np.stack([np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y], axis=-1)
-        cells = np.unique(np.floor((turned + xy - self.low) / self._CELL).astype(int), axis=0)
+        cells = np.floor((turned + xy - self.low) / self._CELL).astype(int)
         outside = (cells < 0).any() or (cells >= self._occupied.shape).any()
         return None if outside else cells
 

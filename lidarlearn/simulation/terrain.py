@@ -1,21 +1,21 @@
 """The height of the ground: gentle slopes that a vehicle follows."""
 
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
 
-class Terrain(Protocol):
+class Terrain(ABC):
     """Smooth ground, before roads, kerbs and embankments are cut into it."""
 
+    @abstractmethod
     def height(self, xy: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch"]:
         """Height of the ground at horizontal positions [m]."""
-        ...
 
 
-class Hills:
+class Hills(Terrain):
     """A sum of waves of 30 to 300 m with random directions: closed form, without bounds.
 
     Args:
@@ -39,7 +39,7 @@ class Hills:
         return np.sin(xy @ self._wave + self._phase) @ self._amplitude
 
 
-class GroundBelow:
+class GroundBelow(Terrain):
     """The smooth ground below a given path.
 
     Args:

@@ -133,14 +133,14 @@ def read_poses(path: Path, camera: bool) -> Float[np.ndarray, "n 4 4"]:
     return poses
 
 
-def extended(xy: Float[np.ndarray, "n 2"], length: float) -> Float[np.ndarray, "m 2"]:
+def extended(path: Float[np.ndarray, "n d"], length: float) -> Float[np.ndarray, "m d"]:
     """A path thinned to 1 m and lengthened straight ahead at both ends by `length` [m]."""
-    steps = np.linalg.norm(np.diff(xy, axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     s = np.concatenate([[0], np.cumsum(steps)])
     grid = np.arange(0, max(s[-1], 1.0), 1.0)
-    thinned = np.column_stack([np.interp(grid, s, xy[:, k]) for k in (0, 1)])
+    thinned = np.column_stack([np.interp(grid, s, path[:, k]) for k in range(path.shape[1])])
     if len(thinned) < 3 or s[-1] < 3:
-        thinned = xy[:1] + np.column_stack([np.arange(3.0), np.zeros(3)])
+        thinned = path[:1] + np.arange(3.0)[:, None] * np.eye(path.shape[1])[0]
     ahead = np.arange(1.0, length)[:, None]
     start, end = thinned[0] - thinned[2], thinned[-1] - thinned[-3]
     before = thinned[0] + ahead[::-1] * start / np.linalg.norm(start)

@@ -16,8 +16,8 @@ def furnish_town(site: Site) -> None:
             _signs(site, street, side)
             _parked_cars(site, street, side, share=site.rng.uniform(0.15, 0.7))
             _houses(site, street, side)
-            _along(site, street, side, trees, beside=site.rng.uniform(1.2, 2.0), spacing=(9, 28))
-            _along(site, street, side, trees, beside=site.rng.uniform(9, 14), spacing=(7, 30))
+            _along(site, street, side, trees, beside=site.rng.uniform(1.2, 2.0), spacing=(9.0, 28.0))
+            _along(site, street, side, trees, beside=site.rng.uniform(9, 14), spacing=(7.0, 30.0))
     _meadow(site, trees, density=1 / 260)
 
 
@@ -30,8 +30,8 @@ def furnish_campus(site: Site) -> None:
             _halls(site, street, side)
             if street.half_width > 2.5:
                 _parked_cars(site, street, side, share=site.rng.uniform(0.1, 0.4))
-            _along(site, street, side, trees, beside=site.rng.uniform(1.5, 4), spacing=(8, 26))
-            _along(site, street, side, trees, beside=site.rng.uniform(6, 16), spacing=(6, 24))
+            _along(site, street, side, trees, beside=site.rng.uniform(1.5, 4), spacing=(8.0, 26.0))
+            _along(site, street, side, trees, beside=site.rng.uniform(6, 16), spacing=(6.0, 24.0))
             _furniture(site, street, side)
     _meadow(site, trees, density=1 / 150)
 
@@ -67,7 +67,7 @@ def _garden(site: Site, spot: Spot, length: float) -> None:
 
 def _halls(site: Site, street: Street, side: int) -> None:
     rng = site.rng
-    for spot in site.spots(street, side, 0.0, (10, 30)):
+    for spot in site.spots(street, side, 0.0, (10.0, 30.0)):
         length, depth, height = rng.uniform(18, 50), rng.uniform(12, 22), rng.uniform(6, 20)
         outward = -np.array([np.cos(spot.facing), np.sin(spot.facing)])
         xy = spot.xy + (rng.uniform(5, 22) + depth / 2) * outward
@@ -89,9 +89,9 @@ def _parked_cars(site: Site, street: Street, side: int, share: float) -> None:
 
 def _signs(site: Site, street: Street, side: int) -> None:
     rng = site.rng
-    for spot in site.spots(street, side, 0.7, (20, 34)):
+    for spot in site.spots(street, side, 0.7, (20.0, 34.0)):
         site.place(objects.lamp(rng), spot.xy, spot.facing, (0.4, 0.4), 0.3)
-    for spot in site.spots(street, side, 0.8, (15, 50)):
+    for spot in site.spots(street, side, 0.8, (15.0, 50.0)):
         kind = rng.integers(3)
         mesh = [objects.sign, objects.bollard, objects.bin_or_box][kind](rng)
         site.place(mesh, spot.xy, spot.along, (0.6, 0.6), 0.3)
@@ -99,7 +99,7 @@ def _signs(site: Site, street: Street, side: int) -> None:
 
 def _furniture(site: Site, street: Street, side: int) -> None:
     rng = site.rng
-    for spot in site.spots(street, side, 1.2, (9, 30)):
+    for spot in site.spots(street, side, 1.2, (9.0, 30.0)):
         mesh = [objects.bench, objects.bollard, objects.bush, objects.bin_or_box][rng.integers(4)](rng)
         site.place(mesh, spot.xy, spot.facing, (1.2, 1.6), 0.2)
 

@@ -1,5 +1,6 @@
 """Checkpoint files: plain data that says what it was trained on, loaded without running anything of it."""
 
+import hashlib
 import pickle
 from pathlib import Path
 from typing import Any
@@ -43,3 +44,12 @@ def load_checkpoint(path: Path, map_location: torch.device | str = "cpu") -> dic
     if not isinstance(checkpoint, dict) or any(key not in checkpoint for key in _NEEDED):
         raise CheckpointError(path, "was not written by lidarlearn's training.")
     return checkpoint
+
+
+def sha256(path: Path) -> str:
+    """Hexadecimal digest of a file, by which a result names the checkpoint it was made with."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()

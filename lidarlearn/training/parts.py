@@ -38,6 +38,22 @@ def build(node: Mapping[str, Any], **arguments: Any) -> Any:
     return target(**merged)
 
 
+def require_trusted(node: object) -> None:
+    """Check, at any depth, that a config out of a checkpoint names nothing but classes that `build` accepts.
+
+    Raises:
+        UntrustedTargetError: a `_target_` names something else.
+    """
+    if isinstance(node, Mapping):
+        if "_target_" in node:
+            _trusted_class(node["_target_"])
+        for value in node.values():
+            require_trusted(value)
+    elif isinstance(node, list | tuple):
+        for value in node:
+            require_trusted(value)
+
+
 def _trusted_class(name: object) -> type:
     if not isinstance(name, str) or not name.startswith(TRUSTED_PACKAGES):
         raise UntrustedTargetError(f"_target_ {name!r} is not built: only classes of {', '.join(TRUSTED_PACKAGES)}* are")

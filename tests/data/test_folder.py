@@ -55,6 +55,15 @@ def test_point_times_and_intensities(tmp_path):
     assert scan.intensities is not None and (scan.intensities == 0.5).all()
 
 
+def test_deskewing_needs_point_times(tmp_path):
+    write_scans(tmp_path / "without")
+    (tmp_path / "with").mkdir()
+    write_pcd(tmp_path / "with" / "0.pcd", random_points(0), TIMES)
+    assert len(folder(tmp_path, deskew=True).sequence("with")) == 1
+    with pytest.raises(UserError, match=r"data\.deskew=false"):
+        folder(tmp_path, deskew=True).sequence("without")
+
+
 def test_relative_times_of_any_unit():
     expected = torch.tensor([-0.5, 0.0, 0.5])
     for times in ([0.0, 50.0, 100.0], [1.6e9, 1.6e9 + 0.05, 1.6e9 + 0.1]):

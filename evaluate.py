@@ -1,0 +1,6 @@
+"""Evaluate odometries: `python evaluate.py [ckpt=...] [methods=[...]] [data=...]`; see README.md and configs/evaluate.yaml."""
+
+from lidarlearn.commands.evaluate import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""Names of methods, as in the paper: `<initialization>+<association>_<map>`, or an initialization alone."""
+
+from dataclasses import dataclass
+
+from lidarlearn.errors import UserError
+
+INITIALIZATIONS = ("ni", "cv", "ei", "posenet")
+BACKENDS = tuple(f"{association}_{map_}" for association in ("p", "kd", "vh") for map_ in ("f2f", "f2m"))
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method by its parts.
+
+    Args:
+        initialization: ni, cv, ei or posenet.
+        backend: e.g. "kd_f2m"; None where the initialization is scored alone.
+    """
+
+    initialization: str
+    backend: str | None = None
+
+    def __str__(self) -> str:
+        return self.initialization if self.backend is None else f"{self.initialization}+{self.backend}"
+
+
+def parse_method(name: str) -> Method:
+    """The method of a name such as "cv+kd_f2m" or "posenet", in any case.
+
+    Raises:
+        UserError: there is no such method.
+    """
+    initialization, plus, backend = name.lower().partition("+")
+    if initialization not in INITIALIZATIONS or (plus and backend not in BACKENDS):
+        raise UserError(
+            f"methods: there is no method '{name}'.\n"
+            f"  change: <initialization>+<association>_<map>, e.g. cv+kd_f2m, or an initialization alone; "
+            f"initializations are {', '.join(INITIALIZATIONS)}, the rest is one of {', '.join(BACKENDS)}"
+        )
+    return Method(initialization, backend if plus else None)

@@ -1,0 +1,178 @@
+"""Run odometries over sequences and export what they say; scoring reads nothing but these files."""
+
+import json
+import statistics
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from torch import Tensor
+
+from lidarlearn.data.sequence import Sequence
+from lidarlearn.errors import UserError
+from lidarlearn.evaluation.trajectories import (
+    read_trajectory,
+    to_lidar_frame,
+    to_reference_frame,
+    write_kitti,
+    write_tum,
+)
+from lidarlearn.odometry.health import Health, write_health
+from lidarlearn.odometry.odometry import ScanByScan
+
+
+@dataclass(frozen=True)
+class Export:
+    """The files that a method leaves for a sequence.
+
+    Args:
+        folder: `trajectories/<method>`.
+        sequence: name of the sequence.
+    """
+
+    folder: Path
+    sequence: str
+
+    @property
+    def kitti(self) -> Path:
+        """Poses of the data set's reference frame, KITTI format."""
+        return self.folder / f"{self.sequence}.txt"
+
+    @property
+    def tum(self) -> Path:
+        """The same, TUM format."""
+        return self.folder / f"{self.sequence}.tum"
+
+    @property
+    def health(self) -> Path:
+        """One row per frame, see `Health`."""
+        return self.folder / f"{self.sequence}.health.csv"
+
+    @property
+    def summary(self) -> Path:
+        """Speed and the summary of the health records."""
+        return self.folder / f"{self.sequence}.json"
+
+
+def run_odometry(
+    odometry: ScanByScan,
+    sequence: Sequence,
+    export: Export,
+    deskew: bool = False,
+    advance: Callable[[], None] = lambda: None,
+) -> None:
+    """Feed a sequence to an odometry and export trajectory, health records and speed.
+
+    Reading scans is not part of the speed. Where a scan cannot be read, what came before it is exported, under names
+    that end in `.partial`, before the error goes on.
+
+    Args:
+        odometry: a fresh one.
+        sequence: what it is fed with.
+        export: where the files go.
+        deskew: whether the odometry is told the points' times.
+        advance: called after each scan.
+    """
+    poses: list[Tensor] = []
+    records: list[Health] = []
+    seconds = 0.0
+    try:
+        for scan in sequence:
+            start = time.perf_counter()
+            frame = odometry.register_scan(scan.points, scan.times if deskew else None)
+            seconds += time.perf_counter() - start
+            poses.append(frame.T_world_lidar)
+            records.append(frame.health)
+            advance()
+    except UserError:
+        if poses:
+            _write(Export(export.folder, f"{export.sequence}.partial"), sequence, poses, records, seconds)
+        raise
+    _write(export, sequence, poses, records, seconds)
+
+
+def read_export(export: Export, sequence: Sequence) -> tuple[Float[Tensor, "n 4 4"], dict[str, Any]]:
+    """Poses of the LiDAR and the summary of an exported run."""
+    poses = read_trajectory(export.kitti)
+    frame = sequence.reference_frame
+    summary = json.loads(export.summary.read_text())
+    return to_lidar_frame(poses, frame, frame, sequence.T_reference_lidar), summary
+
+
+class RunProgress:
+    """A bar for each running method and sequence, and one line that stays when it is done."""
+
+    def __init__(self) -> None:
+        self._console = Console()
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("scans"),
+            TimeRemainingColumn(),
+            console=self._console,
+            transient=True,
+            disable=not self._console.is_terminal,
+        )
+
+    def __enter__(self) -> "RunProgress":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def start(self, method: str, sequence: Sequence) -> TaskID:
+        """Show a new bar."""
+        return self._progress.add_task(f"{method} on {sequence.name}", total=len(sequence))
+
+    def advance(self, task: TaskID) -> None:
+        """One scan more."""
+        self._progress.advance(task)
+
+    def done(self, task: TaskID, method: str, sequence: Sequence, frames_per_second: float, flagged: int) -> None:
+        """Replace the bar by a line."""
+        self._progress.remove_task(task)
+        self._console.print(
+            f"{method:<16} {sequence.name:<12} {len(sequence):>5} scans  {frames_per_second:6.1f} frames/s  "
+            f"{flagged} flagged",
+            highlight=False,
+        )
+
+
+def summarize_health(records: Iterable[Health]) -> dict[str, float | int | None]:
+    """Counts of what was flagged, and means, over a sequence; the first frame registers nothing and is left out."""
+    registered = list(records)[1:]
+    return {
+        "flagged": sum(h.flagged for h in registered),
+        "recovered": sum(h.status == "recovered" for h in registered),
+        "coasted": sum(h.status in ("coasted", "restarted") for h in registered),
+        "degenerate": sum(h.degenerate for h in registered),
+        "implausible": sum(h.implausible for h in registered),
+        "mean_iterations": _mean([h.iterations for h in registered]),
+        "mean_inlier_share": _mean([h.inlier_share for h in registered]),
+        "mean_rmse_m": _mean([h.rmse_m for h in registered]),
+    }
+
+
+def _write(
+    export: Export, sequence: Sequence, poses: list[Tensor], records: list[Health], seconds: float
+) -> None:
+    T_world = to_reference_frame(torch.stack(poses), sequence.T_reference_lidar)
+    timestamps = None if sequence.timestamps is None else sequence.timestamps[: len(poses)]
+    write_kitti(export.kitti, T_world)
+    write_tum(export.tum, T_world, timestamps)
+    write_health(export.health, records)
+    speed = len(poses) / max(seconds, 1e-9)
+    summary = {"frames_per_second": speed, "health": summarize_health(records)}
+    export.summary.write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def _mean(values: list[float]) -> float | None:
+    return statistics.fmean(values) if values else None

@@ -1,0 +1,43 @@
+"""PoseNet as an initialization."""
+
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.odometry.initialization.base import InitialMotion, Initialization
+
+
+class TrainedNetwork(Protocol):
+    """What is needed of a network: its image, and the relative pose it sees in two of them."""
+
+    projection: SphericalProjection
+    device: torch.device
+
+    def relative_pose(self, reference: Float[Tensor, "b 3 h w"], target: Float[Tensor, "b 3 h w"]) -> Tensor:
+        """`T_ref_new` (b, 4, 4), float64."""
+
+
+class PoseNetInitialization(Initialization):
+    """The motion that a trained network sees between the last two scans.
+
+    Args:
+        network: a trained network, e.g. `lidarlearn.training.trained_network.load_trained_network(ckpt)`.
+
+    Source: Dellenbach et al. 2021, III-A "Initialization", IV-C.
+    """
+
+    def __init__(self, network: TrainedNetwork) -> None:
+        self._network = network
+        self._previous: Tensor | None = None
+
+    def predict(self, points: Float[Tensor, "n 3"], last_motion: Float[Tensor, "4 4"]) -> InitialMotion:
+        """The network's estimate; the identity for the first scan."""
+        vertices = self._network.projection.vertex_map(points.to(self._network.device))[None]
+        previous, self._previous = self._previous, vertices
+        if previous is None:
+            return InitialMotion(se3.identity(device=last_motion.device), "posenet")
+        return InitialMotion(self._network.relative_pose(previous, vertices)[0].to(last_motion), "posenet")

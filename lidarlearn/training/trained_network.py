@@ -1,0 +1,57 @@
+"""A trained network out of its checkpoint, without the machinery that trained it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lidarlearn.geometry import se3
+from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.training.checkpoints import load_checkpoint
+from lidarlearn.training.parts import build
+
+_PREFIX = "model."  # of the network's entries in the state of a PoseNetModule
+
+
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """A network ready to predict.
+
+    Args:
+        network: in evaluation mode; maps two vertex maps to the six parameters of `se3.from_euler`.
+        projection: the image it was trained on.
+        device: where it is.
+        trained_on: data, loss and versions of its training, see `PoseNetModule`.
+    """
+
+    network: nn.Module
+    projection: SphericalProjection
+    device: torch.device
+    trained_on: dict[str, Any]
+
+    @torch.no_grad()
+    def relative_pose(
+        self, reference: Float[Tensor, "batch 3 h w"], target: Float[Tensor, "batch 3 h w"]
+    ) -> Float[Tensor, "batch 4 4"]:
+        """`T_ref_new`, float64, from two vertex maps [m] made with `projection`."""
+        return se3.from_euler(self.network(reference, target).double())
+
+
+def load_trained_network(path: Path | str, device: torch.device | str = "cpu") -> TrainedNetwork:
+    """Rebuild a network from a checkpoint alone, without running any code of the file.
+
+    Raises:
+        CheckpointError: the file is missing, is no checkpoint of this project, or holds more than plain data.
+        UntrustedTargetError: it names classes that are not ours.
+    """
+    checkpoint = load_checkpoint(Path(path), map_location=device)
+    parameters = checkpoint["hyper_parameters"]
+    network = build(parameters["model"])
+    state = {k.removeprefix(_PREFIX): v for k, v in checkpoint["state_dict"].items() if k.startswith(_PREFIX)}
+    network.load_state_dict(state)
+    trained_on = parameters["trained_on"]
+    projection = SphericalProjection(**trained_on["projection"])
+    return TrainedNetwork(network.to(device).eval(), projection, torch.device(device), trained_on)

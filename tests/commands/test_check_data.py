@@ -1,0 +1,105 @@
+import subprocess
+import sys
+
+import pytest
+
+from lidarlearn.commands.check_data import compose_data_set, data_groups, main
+from lidarlearn.data.sequence import DataSet
+from tests.data.writers import (
+    write_float32,
+    write_ford_campus,
+    write_kitti_odometry,
+    write_kitti_raw,
+    write_nclt,
+)
+
+DATA_ON_DISK = [name for name in data_groups() if not name.startswith("simulated")]
+ODOMETRY = [f"{i:02d}" for i in range(22)]
+SPLITS = {
+    "kitti_00-08": (ODOMETRY[:9], ODOMETRY[9:11]),
+    "kitti_11-21": (ODOMETRY[11:], ODOMETRY[:11]),
+    "kitti_00-21": (ODOMETRY, ODOMETRY[:11]),
+    "kitti_00_02-10": (ODOMETRY[:1] + ODOMETRY[2:11], ["01"]),
+    "kitti_00_02-21": (ODOMETRY[:1] + ODOMETRY[2:], ["01"]),
+}
+
+
+def only(name):
+    return [f"data.{split}_sequences=[{name}]" for split in ("train", "val", "test")]
+
+
+def run(capsys, *arguments):
+    with pytest.raises(SystemExit) as exited:
+        main(arguments)
+    return exited.value.code, capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", DATA_ON_DISK)
+def test_every_data_set_composes_and_has_an_answer_to_an_absent_root(name, tmp_path, capsys):
+    data = compose_data_set([f"data={name}"])
+    assert isinstance(data, DataSet)
+    assert not set(data.val_sequences) & set(data.test_sequences) or name == "folder"
+    code, printed = run(capsys, "check", f"data={name}", f"data.root={tmp_path / 'nowhere'}")
+    assert code == 1 and "no such folder" in printed and "data.root" in printed
+
+
+@pytest.mark.parametrize("name", SPLITS)
+def test_kitti_is_split_as_in_the_paper(name):
+    data = compose_data_set([f"data={name}"])
+    train, test = SPLITS[name]
+    assert list(data.train_sequences) == train and list(data.test_sequences) == test
+    assert set(data.val_sequences) <= set(train)
+
+
+def test_nclt_is_split_as_in_the_paper():
+    data = compose_data_set(["data=nclt"])
+    assert len(data.train_sequences) == 10
+    assert (min(data.train_sequences), max(data.train_sequences)) == ("2012-01-22", "2012-03-31")
+    assert data.test_sequences == ("2012-01-08",)
+    assert set(data.val_sequences) <= set(data.train_sequences)
+
+
+def test_sequence_numbers_from_the_command_line():
+    assert compose_data_set(["data=kitti_00-08", "data.test_sequences=[04,10,08]"]).test_sequences == ("04", "10", "08")
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "sequence"),
+    [
+        ("kitti_00-08", write_kitti_odometry, "04"),
+        ("kitti_raw", write_kitti_raw, "2011_09_26_drive_0009"),
+        ("nclt", write_nclt, "2012-01-08"),
+        ("ford_campus", write_ford_campus, "IJRR-Dataset-1"),
+        ("folder", lambda root: write_float32(root / "drive" / "0.bin", [[1, 2, 3]]), "drive"),
+    ],
+)
+def test_a_whole_copy_is_usable_and_a_partial_one_is_described(tmp_path, capsys, name, write, sequence):
+    write(tmp_path)
+    code, printed = run(capsys, "check", f"data={name}", f"data.root={tmp_path}", *only(sequence))
+    assert code == 0 and sequence in printed and "usable as configured" in printed
+    code, printed = run(capsys, "check", f"data={name}", f"data.root={tmp_path}", *only("99"))
+    assert code == 1 and "missing 99" in printed and "NOT usable" in printed
+    assert f"({sequence})" in printed  # what there is instead
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        ([], 2, "usage"),
+        (["data=nclt"], 2, "usage"),
+        (["check"], 2, "kitti_00-08"),
+        (["check", "data=kity"], 1, "kitti_00-08"),
+        (["check", "data=nclt", "data.rot=/x"], 1, "data.rot"),
+        (["check", "data=nclt", "data.train_sequences=["], 1, "error"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_explained(capsys, arguments, code, said):
+    exit_code, printed = run(capsys, *arguments)
+    assert exit_code == code and said in printed
+
+
+def test_the_command_itself(tmp_path):
+    command = [sys.executable, "-m", "lidarlearn.data", "check", "data=kitti_00-08", f"data.root={tmp_path}"]
+    finished = subprocess.run(command, capture_output=True, text=True)
+    assert finished.returncode == 1
+    assert "holds no folder 'sequences'" in finished.stdout and "Traceback" not in finished.stdout + finished.stderr

@@ -1,0 +1,152 @@
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.simulated import SimulatedDataSet, image_path
+from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.simulation import scenes
+from lidarlearn.simulation.sensors import hdl64
+from lidarlearn.simulation.worlds import PRESETS
+
+
+@pytest.fixture(autouse=True, scope="module")
+def empty_town():
+    """Worlds of bare streets: what is tested here is how scans are kept, not what they show."""
+    bare = replace(PRESETS["urban"], furnish=lambda site: None, side_streets=None, pedestrians=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "urban", bare)
+        yield
+
+
+def _data_set(root, **changes):
+    settings = {"train_sequences": ["urban_00"], "val_sequences": ["urban_01"], "test_sequences": ["urban_02"]}
+    settings |= {"frames": 4, "sensor": hdl64(64), "workers": 0}
+    return SimulatedDataSet(root, SphericalProjection(), **(settings | changes))
+
+
+def _bytes(data_set):
+    names = [*data_set.train_sequences, *data_set.val_sequences, *data_set.test_sequences]
+    return {name: [scan.points.numpy().tobytes() for scan in data_set.sequence(name)] for name in names}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    data_set = _data_set(tmp_path_factory.mktemp("simulated"))
+    data_set.prepare()
+    return data_set
+
+
+def test_sequences_are_scans_with_ground_truth(made):
+    sequence = made.sequence("urban_02")
+    assert len(sequence) == len(sequence.T_world_lidar) == len(sequence.timestamps) == 4
+    assert sequence.T_world_lidar.dtype == torch.float64
+    assert torch.equal(sequence.T_world_lidar[0], torch.eye(4, dtype=torch.float64))
+    assert sequence.scan(3).points.dtype == torch.float32 and sequence.scan(3).times is None
+
+
+def test_stored_scans_are_those_of_the_drive(made):
+    drive = made._drive("urban_01")
+    assert torch.equal(made.sequence("urban_01").scan(2).points, drive.scan(2).points)
+
+
+def test_sequences_are_different_places(made):
+    assert made.sequence("urban_00").fingerprint != made.sequence("urban_02").fingerprint
+    assert not torch.equal(made.sequence("urban_00").T_world_lidar, made.sequence("urban_02").T_world_lidar)
+
+
+@pytest.mark.parametrize("workers", [2, 5])
+def test_the_number_of_workers_changes_no_byte(made, tmp_path, workers):
+    other = _data_set(tmp_path, workers=workers)
+    other.prepare()
+    assert _bytes(other) == _bytes(made)
+
+
+def test_prepare_again_writes_nothing(made):
+    files = sorted(made.root.rglob("*.npy"))
+    before = [file.stat().st_mtime_ns for file in files]
+    made.prepare()
+    assert [file.stat().st_mtime_ns for file in files] == before
+
+
+def test_an_interrupted_run_is_taken_up_where_it_stopped(made, tmp_path):
+    data_set = _data_set(tmp_path)
+    data_set.prepare()
+    folder = data_set.folder(data_set._drive("urban_00"))
+    kept = image_path(folder, 1).stat().st_mtime_ns
+    image_path(folder, 2).unlink()
+    image_path(folder, 3).with_suffix(".tmp").write_bytes(b"half a fi")
+    with pytest.raises(DataSetNotFoundError, match="scan 2 of sequence urban_00"):
+        data_set.sequence("urban_00")
+    assert {finding.what: finding.level for finding in data_set.check().findings}["urban_00"] == "odd"
+    data_set.prepare()
+    assert image_path(folder, 1).stat().st_mtime_ns == kept
+    assert _bytes(data_set) == _bytes(made)
+
+
+def test_a_failure_while_making_is_not_swallowed(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "lidarlearn.data.simulated.image_path", lambda folder, index: folder / "nowhere" / f"{index}.npy"
+    )
+    with pytest.raises(FileNotFoundError):
+        _data_set(tmp_path, workers=2).prepare()
+
+
+def test_other_settings_are_made_beside(made):
+    other = _data_set(made.root, frames=3)
+    with pytest.raises(DataSetNotFoundError, match=r"prepare\(\)"):
+        other.sequence("urban_00")
+    other.prepare()
+    assert len(other.sequence("urban_00")) == 3 and len(made.sequence("urban_00")) == 4
+
+
+def test_max_frames_makes_and_offers_the_first_scans_of_the_same_drive(made, tmp_path):
+    short = _data_set(tmp_path, max_frames=2)
+    short.prepare()
+    assert len(short.sequence("urban_00")) == 2
+    assert torch.equal(short.sequence("urban_00").scan(1).points, made.sequence("urban_00").scan(1).points)
+    assert len(list(tmp_path.rglob("*.npy"))) == 6
+
+
+def test_distorted_scans_carry_times(tmp_path):
+    data_set = _data_set(tmp_path, motion_distortion=True, test_sequences=[], val_sequences=[], max_frames=1)
+    data_set.prepare()
+    scan = data_set.sequence("urban_00").scan(0)
+    assert scan.times is not None and scan.times.shape == scan.points.shape[:1]
+
+
+def test_a_pose_file_is_the_path(tmp_path):
+    poses = scenes.straight_path(5, 1.38)
+    np.savetxt(tmp_path / "04.txt", poses[:, :3].reshape(-1, 12))
+    data_set = _data_set(tmp_path, pose_file=tmp_path / "04.txt", pose_file_frame="lidar", max_frames=1)
+    data_set.prepare()
+    assert data_set._drive("urban_00").T_world_lidar[3, :3, 3].tolist() == pytest.approx([3 * 1.38, 0, 0])
+
+
+def test_a_truncated_file_is_named(made):
+    path = image_path(made.folder(made._drive("urban_01")), 3)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:300])
+    with pytest.raises(DamagedFileError, match=path.name):
+        made.sequence("urban_01").scan(3)
+    path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("name", ["highway_00", "urban", "00", "urban_x"])
+def test_names_of_other_worlds_are_refused(made, name):
+    with pytest.raises(DataSetNotFoundError, match="urban_00"):
+        made.sequence(name)
+
+
+def test_nothing_is_corrected_in_simulated_scans(tmp_path):
+    with pytest.raises(ValueError, match="beam_correction_deg"):
+        _data_set(tmp_path, beam_correction_deg=0.205)
+
+
+def test_check_reports_what_is_there(made):
+    assert made.check().usable
+    assert {finding.level for finding in made.check().findings} == {"found"}
+    assert os.path.isdir(made.root)

@@ -1,0 +1,29 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from lidarlearn.simulation.meshes import box
+from lidarlearn.simulation.raycasting import RayCaster
+
+
+def _ray(origin, direction):
+    return np.array([[*origin, *direction]], dtype=np.float32)
+
+
+def test_rays_hit_a_box_exactly():
+    caster = RayCaster(box(2.0, 4.0, 6.0))
+    hits = caster.cast(np.concatenate([_ray((10, 0, 3), (-1, 0, 0)), _ray((0, 10, 3), (0, -1, 0))]))
+    assert hits.distances == pytest.approx([9.0, 8.0])
+    assert np.abs(hits.normals) == pytest.approx(np.array([[1.0, 0, 0], [0, 1, 0]]))
+
+
+def test_rays_that_miss_go_on_forever():
+    hits = RayCaster(box(1.0, 1.0, 1.0)).cast(_ray((0, 0, 5), (0, 0, 1)))
+    assert np.isinf(hits.distances).all() and not hits.normals.any()
+
+
+def test_open3d_is_not_imported_before_rays_are_cast():
+    code = "import sys, lidarlearn.simulation.drive, lidarlearn.data.simulated; sys.exit('open3d' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
