@@ -50,14 +50,15 @@ def fit_planes(covariances: Float[Tensor, "*batch 6"]) -> PlaneFit:
 
 def normal_map(
     vertex_map: Float[Tensor, "*batch 3 h w"],
-    window: tuple[int, int] = (3, 3),
-    max_range_jump: float = 0.05,
+    window: tuple[int, int] = (3, 5),
+    max_range_jump: float = 0.1,
     max_roughness: float = 0.5,
 ) -> Float[Tensor, "*batch 3 h w"]:
     """Unit normals from the activated pixels around each pixel, pointing towards the sensor, zeros where undefined.
 
     Moments are taken relative to the pixel's own point, so float32 loses nothing at long range. A normal needs four
-    neighbours, points that span a plane, and no depth jump among those used.
+    neighbours, some of them in other rows and some in other columns (a single line of points lies in any plane), and
+    no depth jump among those used.
 
     Args:
         vertex_map: points [m] in the sensor frame, zeros where no point fell.
@@ -68,14 +69,15 @@ def normal_map(
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood".
     """
-    count, first, second = _window_moments(vertex_map, window, max_range_jump)
+    count, rows, columns, first, second = _window_moments(vertex_map, window, max_range_jump)
     n = count.clamp(min=1)[..., None]
     mean = first / n
     x, y, z = mean.unbind(-1)
     covariances = second / n - torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], dim=-1)
     plane = fit_planes(covariances)
     across, along = plane.variances[..., 0], plane.variances[..., 1]
-    defined = (count >= 5) & (along > 0) & (across <= max_roughness**2 * along) & activated(vertex_map)
+    spans_patch = (rows >= 2) & (columns >= 2)
+    defined = (count >= 5) & spans_patch & (along > 0) & (across <= max_roughness**2 * along) & activated(vertex_map)
     points = vertex_map.movedim(-3, -1)
     towards = torch.where((plane.normals * points).sum(-1) > 0, -1.0, 1.0)
     normals = plane.normals * (towards * defined)[..., None]
@@ -84,8 +86,11 @@ def normal_map(
 
 def _window_moments(
     vertex_map: Float[Tensor, "*batch 3 h w"], window: tuple[int, int], max_range_jump: float
-) -> tuple[Float[Tensor, "*batch h w"], Float[Tensor, "*batch h w 3"], Float[Tensor, "*batch h w 6"]]:
-    """Count, sum and sum of products of the neighbours' offsets from the centre, the centre included."""
+) -> tuple[Tensor, Tensor, Tensor, Float[Tensor, "*batch h w 3"], Float[Tensor, "*batch h w 6"]]:
+    """Count of the neighbours (all, in other rows, in other columns), sum and sum of products of their offsets.
+
+    The centre itself is counted among all, at offset zero.
+    """
     rows, columns = window[0] // 2, window[1] // 2
     h, w = vertex_map.shape[-2:]
     batch = vertex_map.shape[:-3]
@@ -93,19 +98,20 @@ def _window_moments(
     image = torch.cat([vertex_map, ranges], dim=-3).reshape(-1, 4, h, w)
     padded = pad(pad(image, (columns, columns, 0, 0), mode="circular"), (0, 0, rows, rows))
     tolerance = max_range_jump * image[:, 3]
-    sums = image.new_zeros(10, *image[:, 0].shape)
-    sums[0] = 1  # the centre itself, at offset zero
+    sums = image.new_zeros(12, *image[:, 0].shape)
+    sums[0] = 1
     for row in range(2 * rows + 1):
         for column in range(2 * columns + 1):
             if (row, column) == (rows, columns):
                 continue
             neighbour = padded[:, :, row : row + h, column : column + w]
             used = ((neighbour[:, 3] - image[:, 3]).abs() < tolerance) & (neighbour[:, 3] > 0)
+            terms = (used, used * (row != rows), used * (column != columns))
             dx, dy, dz = ((neighbour[:, :3] - image[:, :3]) * used[:, None]).unbind(1)
-            for i, term in enumerate((used, dx, dy, dz, dx * dx, dx * dy, dx * dz, dy * dy, dy * dz, dz * dz)):
+            for i, term in enumerate((*terms, dx, dy, dz, dx * dx, dx * dy, dx * dz, dy * dy, dy * dz, dz * dz)):
                 sums[i] += term
-    sums = sums.movedim(0, -1).reshape(*batch, h, w, 10)
-    return sums[..., 0], sums[..., 1:4], sums[..., 4:]
+    sums = sums.movedim(0, -1).reshape(*batch, h, w, 12)
+    return sums[..., 0], sums[..., 1], sums[..., 2], sums[..., 3:6], sums[..., 6:]
 
 
 def _adjugate(s: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:

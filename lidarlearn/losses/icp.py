@@ -11,6 +11,8 @@ class IcpLoss(ProjectiveLoss):
 
     Args:
         normal_window: rows and columns of the neighbourhood of reference normals [px], odd.
+        max_range_jump: see `normal_map`.
+        max_roughness: see `normal_map`.
 
     Source: Dellenbach et al. 2021, III-B "Unsupervised training".
     """

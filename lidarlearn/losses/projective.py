@@ -31,7 +31,7 @@ class ProjectiveLoss(nn.Module, ABC):
     """
 
     def __init__(
-        self, normal_window: tuple[int, int] = (3, 3), max_range_jump: float = 0.05, max_roughness: float = 0.5
+        self, normal_window: tuple[int, int] = (3, 3), max_range_jump: float = 0.15, max_roughness: float = 0.2
     ) -> None:
         super().__init__()
         self.normal_window = (int(normal_window[0]), int(normal_window[1]))

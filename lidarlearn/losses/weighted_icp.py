@@ -16,12 +16,20 @@ class WeightedIcpLoss(ProjectiveLoss):
     Args:
         sigma_m: distance at which an association counts 1/e [m].
         normal_window: rows and columns of the neighbourhood of reference normals [px], odd.
+        max_range_jump: see `normal_map`.
+        max_roughness: see `normal_map`.
 
     Source: Dellenbach et al. 2021, III-B "Unsupervised training"; weights as in III-A "Energy minimized".
     """
 
-    def __init__(self, sigma_m: float = 0.5, normal_window: tuple[int, int] = (3, 5)) -> None:
-        super().__init__(normal_window)
+    def __init__(
+        self,
+        sigma_m: float = 0.5,
+        normal_window: tuple[int, int] = (3, 3),
+        max_range_jump: float = 0.15,
+        max_roughness: float = 0.2,
+    ) -> None:
+        super().__init__(normal_window, max_range_jump, max_roughness)
         self.sigma_m = sigma_m
 
     def rho(

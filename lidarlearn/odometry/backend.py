@@ -95,7 +95,7 @@ class Backend:
             self.max_search_distance_m,
             self._normals(queries),
         )
-        best = (result.overlap * result.inlier_share).argmax()
+        best = result.fit.argmax()
         return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar[best]))
 
     def _normals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"] | None:

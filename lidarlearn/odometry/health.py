@@ -24,9 +24,9 @@ class Health:
         overlap: share of the points that have a neighbour in the map.
         inlier_share: share of those that fit it.
         rmse_m: weighted root mean square of the residuals [m].
-        min_information: how much the map says about the weakest direction of motion, 0 (nothing) to 1.
+        min_information: share of the points that notice a move in the weakest direction.
         degenerate: whether that is too little, so that the motion in this direction is a prediction.
-        weakest_direction: that direction in the sensor's frame: translation, then rotation times the mean range.
+        weakest_direction: that direction, a unit vector in the sensor's frame.
         deviation_m: distance between the registered motion and constant velocity [m].
         deviation_deg: angle between the two [deg].
         implausible: whether that is more than a vehicle can do in one scan.
@@ -43,7 +43,7 @@ class Health:
     rmse_m: float = 0.0
     min_information: float = 1.0
     degenerate: bool = False
-    weakest_direction: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    weakest_direction: tuple[float, ...] = (0.0, 0.0, 0.0)
     deviation_m: float = 0.0
     deviation_deg: float = 0.0
     implausible: bool = False
@@ -54,15 +54,15 @@ class Health:
         return self.status != "ok" or self.degenerate or self.implausible
 
 
-_DIRECTION = ("tx", "ty", "tz", "rx", "ry", "rz")
+_AXES = ("x", "y", "z")
 
 
 def write_health(path: Path, records: Iterable[Health]) -> None:
-    """Write one row per frame as CSV; the weakest direction takes six columns."""
+    """Write one row per frame as CSV; the weakest direction takes three columns."""
     names = [f.name for f in fields(Health) if f.name != "weakest_direction"]
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow([*names, "flagged", *(f"weakest_{axis}" for axis in _DIRECTION)])
+        writer.writerow([*names, "flagged", *(f"weakest_{axis}" for axis in _AXES)])
         for record in records:
             row = asdict(record)
             direction = row.pop("weakest_direction")

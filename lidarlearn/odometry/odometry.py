@@ -38,7 +38,7 @@ class Judgement:
         min_points: fewest points that can be registered.
         min_overlap: smallest acceptable share of points that have a neighbour in the map.
         min_inlier_share: smallest acceptable share of those that fit it.
-        min_information: below it the weakest direction counts as degenerate.
+        min_information: the weakest direction counts as degenerate below it, see `RegistrationResult.information`.
         max_deviation_m: largest plausible change of motion from one scan to the next [m]; 0.5 m at 10 Hz is an
             acceleration of 50 m/s^2.
         max_deviation_deg: largest plausible change of rotation from one scan to the next [deg].
@@ -175,7 +175,7 @@ class Odometry(ScanByScan):
         if self._recovery and source != "start" and (health.implausible or not self._accepts(result)):
             hypotheses = surprise_motions(T_previous_new, self._motion)
             second = self._register(scan, self._search(scan, hypotheses))
-            if _fit(second) > _fit(result):
+            if second.fit > result.fit:
                 result, health = second, self._assess(scan, second, "recovery")
             health = replace(health, status="recovered")
         if not self._accepts(result):
@@ -251,11 +251,6 @@ class Odometry(ScanByScan):
         """How far a point at the mean range was from where the guess had it."""
         shift_m, angle_deg = _difference(T_previous_new, self._motion_to(T_world_new))
         return shift_m + math.radians(angle_deg) * scan.points.norm(dim=1).mean().item()
-
-
-def _fit(result: RegistrationResult) -> float:
-    """Share of all points that fit the map."""
-    return (result.overlap * result.inlier_share).item()
 
 
 def _difference(T_a: Tensor, T_b: Tensor) -> tuple[float, float]:

@@ -12,6 +12,11 @@ from lidarlearn.registration.residuals import PointToPlane, Residual
 from lidarlearn.registration.weights import Proximity, RobustWeight
 
 
+# A residual notices a move of 1 m if it changes by more than this [m]: the sine of 17 deg, beyond the error of nearly
+# all normals.
+_NOTICEABLE = 0.3
+
+
 @dataclass(frozen=True)
 class RegistrationResult:
     """Where a scan fits, and how well: enough to judge an alignment instead of trusting it.
@@ -24,11 +29,13 @@ class RegistrationResult:
         converged: whether the last step was below the tolerances, at the final search distance.
         overlap: share of the points that have a map neighbour with a normal within the search distance.
         inlier_share: share of those whose residual is below `inlier_residual_m`.
+        fit: mean over all points of exp(-(r / fit_residual_m)^2), 0 for those without a neighbour: sharper than the
+            inlier share, it tells the right pose from its neighbours.
         rmse_m: weighted root mean square of the residuals [m].
         hessian: of the weighted half squares by (translation [m], rotation [rad]) in the sensor's frame.
-        information: the six eigenvalues, ascending, of the Hessian per unit of weight, with rotations measured by
-            the displacement they cause at the mean range: 1 means that every residual sees the direction fully.
-        weakest_direction: unit eigenvector (translation, rotation) of the smallest of them.
+        information: weighted share of all points that notice a move along each of the three axes of the position's
+            covariance, ascending: 0 along a corridor, where no residual changes however the pose follows.
+        weakest_direction: unit vector, in the sensor's frame, of the smallest of them.
     """
 
     T_world_lidar: Float[Tensor, "*batch 4 4"]
@@ -36,21 +43,25 @@ class RegistrationResult:
     converged: Bool[Tensor, "*batch"]
     overlap: Float[Tensor, "*batch"]
     inlier_share: Float[Tensor, "*batch"]
+    fit: Float[Tensor, "*batch"]
     rmse_m: Float[Tensor, "*batch"]
     hessian: Float[Tensor, "*batch 6 6"]
-    information: Float[Tensor, "*batch 6"]
-    weakest_direction: Float[Tensor, "*batch 6"]
+    information: Float[Tensor, "*batch 3"]
+    weakest_direction: Float[Tensor, "*batch 3"]
 
 
 @dataclass(frozen=True)
 class _System:
     """Normal equations H xi = -g of one iteration, and what they were made of."""
 
+    jacobians: Float[Tensor, "*batch m 6"]
+    weights: Float[Tensor, "*batch m"]
     H: Float[Tensor, "*batch 6 6"]
     g: Float[Tensor, "*batch 6"]
     weight: Float[Tensor, "*batch"]
     neighbours: Int[Tensor, "*batch"]
     inliers: Int[Tensor, "*batch"]
+    fit: Float[Tensor, "*batch"]
     squares: Float[Tensor, "*batch"]
 
 
@@ -65,10 +76,11 @@ class GaussNewton:
         search_distance_m: correspondences are searched within this distance at the end [m].
         narrowing: factor of the search distance from one iteration to the next, until it is `search_distance_m`.
         coarse_stride: while the search distance is wider, only every so manieth point is used.
-        min_information: directions in which the map says less than this are left as initialized; see
-            `RegistrationResult.information`. Source: Zhang, Kaess & Singh, "On degeneracy of optimization-based
+        min_information: the position is left as initialized in directions of which the map says less than this, see
+            `RegistrationResult.information`. Source: after Zhang, Kaess & Singh, "On degeneracy of optimization-based
             state estimation problems", ICRA 2016.
         inlier_residual_m: a correspondence counts as an inlier below this residual [m].
+        fit_residual_m: scale of `RegistrationResult.fit` [m].
         translation_tolerance_m: converged when a step is shorter [m]...
         rotation_tolerance_deg: ...and turns by less [deg].
         max_step_m: longest translation of one step [m].
@@ -83,6 +95,7 @@ class GaussNewton:
     coarse_stride: int = 4
     min_information: float = 1e-3
     inlier_residual_m: float = 0.2
+    fit_residual_m: float = 0.05
     translation_tolerance_m: float = 1e-3
     rotation_tolerance_deg: float = 5e-3
     max_step_m: float = 1.0
@@ -117,7 +130,7 @@ class GaussNewton:
             used_normals = None if normals is None else normals[::stride]
             distance = max(distance, self.search_distance_m)
             system = self._linearize(points[::stride], association, T, distance, used_normals)
-            step = self._solve(system, points)
+            step = self._solve(system)
             T = T @ se3.exp(step)
             if final:
                 converged = self._is_small(step) & (system.weight > 0)
@@ -125,8 +138,8 @@ class GaussNewton:
                     break
             distance *= self.narrowing
         T = se3.orthonormalize(T)
-        return self._judge(T, iteration, converged, self._linearize(
-            points, association, T, self.search_distance_m, normals), points)
+        system = self._linearize(points, association, T, self.search_distance_m, normals)
+        return _judge(T, iteration, converged, system, len(points))
 
     def _linearize(
         self, points: Tensor, association: Association, T: Tensor, distance_m: float, normals: Tensor | None
@@ -142,22 +155,25 @@ class GaussNewton:
         J = linear.jacobians.flatten(-3, -2)
         wJ = (linear.jacobians * w[..., None, None]).flatten(-3, -2)
         return _System(
+            jacobians=J,
+            weights=w.repeat_interleave(linear.residuals.shape[-1], dim=-1),
             H=(wJ.mT @ J).double(),
             g=(wJ.mT @ linear.residuals.flatten(-2)[..., None]).double()[..., 0],
             weight=w.sum(-1).double(),
             neighbours=mask.sum(-1),
             inliers=(mask & (size < self.inlier_residual_m)).sum(-1),
+            fit=(mask * torch.exp(-((size / self.fit_residual_m) ** 2))).sum(-1),
             squares=(w * size * size).sum(-1).double(),
         )
 
-    def _solve(self, system: _System, points: Tensor) -> Float[Tensor, "*batch 6"]:
-        """The step, without its part in directions of which the map says too little, and not too long."""
-        information, directions, scale = _information(system, points)
-        g = (system.g * scale)[..., None]
-        eigenvalues = (information * system.weight[..., None]).clamp(min=torch.finfo(g.dtype).tiny)
-        known = information > self.min_information
-        step = -(directions @ ((directions.mT @ g)[..., 0] / eigenvalues * known)[..., None])[..., 0] * scale
-        return self._limit(step)
+    def _solve(self, system: _System) -> Float[Tensor, "*batch 6"]:
+        """The minimum of the linearized energy, on condition that the position stays where nothing is known of it."""
+        position = _position(system)
+        step = -(position.covariance @ system.g[..., None])
+        unknown = (position.information < self.min_information)[..., None]
+        along = position.directions.mT @ step[..., :3, :]
+        step = step - position.responses @ (unknown * along)
+        return self._limit(step[..., 0])
 
     def _limit(self, step: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
         max_angle = torch.pi / 180 * self.max_step_deg
@@ -168,29 +184,50 @@ class GaussNewton:
         angle = step[..., 3:].norm(dim=-1) * (180 / torch.pi)
         return (step[..., :3].norm(dim=-1) < self.translation_tolerance_m) & (angle < self.rotation_tolerance_deg)
 
-    def _judge(
-        self, T: Tensor, iterations: int, converged: Tensor, system: _System, points: Tensor
-    ) -> RegistrationResult:
-        information, directions, _ = _information(system, points)
-        return RegistrationResult(
-            T_world_lidar=T,
-            iterations=iterations,
-            converged=converged,
-            overlap=system.neighbours / max(len(points), 1),
-            inlier_share=system.inliers / system.neighbours.clamp(min=1),
-            rmse_m=(system.squares / system.weight.clamp(min=1e-12)).sqrt(),
-            hessian=system.H,
-            information=information,
-            weakest_direction=directions[..., 0],
-        )
+
+def _judge(T: Tensor, iterations: int, converged: Tensor, system: _System, points: int) -> RegistrationResult:
+    position = _position(system)
+    return RegistrationResult(
+        T_world_lidar=T,
+        iterations=iterations,
+        converged=converged,
+        overlap=system.neighbours / max(points, 1),
+        inlier_share=system.inliers / system.neighbours.clamp(min=1),
+        fit=system.fit / max(points, 1),
+        rmse_m=(system.squares / system.weight.clamp(min=1e-12)).sqrt(),
+        hessian=system.H,
+        information=position.information,
+        weakest_direction=position.directions[..., 0],
+    )
 
 
-def _information(system: _System, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Eigenvalues and eigenvectors of the scaled Hessian per unit of weight, and the scale of the six coordinates."""
-    mean_range = points.norm(dim=-1).mean().clamp(min=1.0) if len(points) else points.new_ones(())
-    scale = torch.ones(6, dtype=torch.float64, device=points.device)
-    scale[3:] /= mean_range
-    H = system.H * scale[:, None] * scale / system.weight.clamp(min=1e-12)[..., None, None]
-    # 6x6 and on the critical path: a GPU's eigensolver would cost more than the trip.
-    information, directions = torch.linalg.eigh(torch.nan_to_num(H).cpu())
-    return information.to(points.device), directions.to(points.device), scale
+@dataclass(frozen=True)
+class _Position:
+    """What the normal equations say about the position, along the axes of its covariance.
+
+    Args:
+        covariance: inverse of the Hessian.
+        directions: the axes, unit columns, the least known first.
+        responses: how the whole pose moves, at least energy, when the position moves by one along each axis.
+        information: see `RegistrationResult.information`.
+    """
+
+    covariance: Float[Tensor, "*batch 6 6"]
+    directions: Float[Tensor, "*batch 3 3"]
+    responses: Float[Tensor, "*batch 6 3"]
+    information: Float[Tensor, "*batch 3"]
+
+
+def _position(system: _System) -> _Position:
+    # A ridge far below any information keeps an empty system solvable: its gradient is zero and so is the step.
+    ridge = 1e-9 * system.H.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] + 1e-9
+    # 6x6 and on the critical path: a GPU's solvers would cost more than the trip.
+    H = (torch.nan_to_num(system.H) + ridge * torch.eye(6, dtype=torch.float64, device=system.H.device)).cpu()
+    covariance = torch.linalg.inv(H)
+    variances, directions = torch.linalg.eigh(covariance[..., :3, :3])
+    variances, directions = variances.flip(-1), directions.flip(-1)
+    responses = covariance[..., :, :3] @ directions / variances[..., None, :]
+    notice = (system.jacobians @ responses.to(system.jacobians)).abs() > _NOTICEABLE
+    information = (system.weights[..., None] * notice).mean(-2) if notice.shape[-2] else torch.zeros_like(variances)
+    device = system.H.device
+    return _Position(covariance.to(device), directions.to(device), responses.to(device), information.double())

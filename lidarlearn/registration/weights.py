@@ -71,7 +71,7 @@ class CutOff(RobustWeight):
 class GemanMcClure(RobustWeight):
     """(sigma^2 / (sigma^2 + r^2))^2: outliers fade quadratically, as in KISS-ICP."""
 
-    sigma_m: float = 0.2
+    sigma_m: float = 0.1
 
     def weight(self, residuals: Tensor, squared_distances: Tensor) -> Tensor:
         """The redescending weight."""

@@ -18,7 +18,7 @@ from lidarlearn.simulation.trajectories import Trajectory, extended, on_ground
 from lidarlearn.simulation.worlds import World, build_world, preset
 
 # Part of every fingerprint: to be raised whenever the same settings come to give other scans.
-GENERATOR = 1
+GENERATOR = 2
 
 # Each source of chance has a stream of its own, so that e.g. a static drive takes the way of the lively one.
 _TERRAIN, _MOTION, _WORLD, _SCAN = range(4)

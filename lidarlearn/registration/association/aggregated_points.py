@@ -16,8 +16,9 @@ from lidarlearn.geometry.voxels import grid_sample, voxel_cells
 # The table wraps around in space: two voxels share a slot only if they are 512 (512, 64) cells apart, 205 m (26 m) at
 # 0.4 m, so neighbours never collide and stand side by side in memory.
 _TABLE_BITS = (9, 9, 6)
-_MIN_NEIGHBOURS = 3
+_MIN_NEIGHBOURS = 5
 _MAX_ROUGHNESS = 0.5  # deviation from the plane over the smaller extent in it
+_MIN_EXTENT = 0.15  # smaller extent in the plane over the voxel size: a line of points, as of one beam, has no normal
 
 
 class AggregatedPoints:
@@ -107,7 +108,8 @@ class AggregatedPoints:
         mx, my, mz = (moments[:, 1:4] / n).unbind(-1)
         outer = torch.stack([mx * mx, mx * my, mx * mz, my * my, my * mz, mz * mz], dim=1)
         plane = fit_planes(moments[:, 4:] / n - outer)
-        self._normals[index] = plane.normals * _is_plane(moments[:, 0], plane.variances)[:, None]
+        smallest_extent = _MIN_EXTENT * self.voxel_size_m
+        self._normals[index] = plane.normals * _is_plane(moments[:, 0], plane.variances, smallest_extent)[:, None]
 
     def _compact(self, needed: int) -> None:
         """Move the living points to the front of buffers that hold at least twice their number."""
@@ -135,9 +137,12 @@ def neighbourhood(radius: int, device: torch.device) -> Int[Tensor, "n 3"]:
     return torch.tensor(list(itertools.product(steps, steps, steps)), device=device)
 
 
-def _is_plane(neighbours: Float[Tensor, "m"], variances: Float[Tensor, "m 3"]) -> Bool[Tensor, "m"]:
+def _is_plane(
+    neighbours: Float[Tensor, "m"], variances: Float[Tensor, "m 3"], smallest_extent_m: float
+) -> Bool[Tensor, "m"]:
     across, along = variances[:, 0], variances[:, 1]
-    return (neighbours >= _MIN_NEIGHBOURS) & (along > 0) & (across <= _MAX_ROUGHNESS**2 * along)
+    extended = along >= smallest_extent_m**2
+    return (neighbours >= _MIN_NEIGHBOURS) & extended & (across <= _MAX_ROUGHNESS**2 * along)
 
 
 def _slots(cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:

@@ -1,0 +1,164 @@
+"""Both projective losses: minima, masks, batches, gradients."""
+
+import pytest
+import torch
+
+from lidarlearn.geometry import se3
+from lidarlearn.geometry.normals import normal_map
+from lidarlearn.geometry.projection import activated
+from lidarlearn.losses.icp import IcpLoss
+from lidarlearn.losses.projective import reproject
+from lidarlearn.losses.weighted_icp import WeightedIcpLoss
+from tests.box_world import SMALL, cast
+
+FINE = type(SMALL)(height=32, width=360, fov_up_deg=15.0, fov_down_deg=-20.0)
+TRUTH = torch.tensor([[0.30, -0.05, 0.02, 0.004, -0.006, 0.02]], dtype=torch.float64)
+LOSSES = [IcpLoss(), WeightedIcpLoss(), WeightedIcpLoss(sigma_m=2.0)]
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Reference at the origin, target at the true motion."""
+    reference = FINE.vertex_map(cast(se3.identity(), FINE))[None]
+    target = FINE.vertex_map(cast(se3.from_euler(TRUTH)[0], FINE))[None]
+    return reference, target
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_it_vanishes_for_a_scan_against_itself(loss, pair):
+    result = loss(torch.zeros(1, 6), pair[0], pair[0], FINE)
+    assert result.loss < 1e-9
+    assert 0.3 < result.parts["activated_share"] <= 1
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("direction", range(6))
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_truth_is_better_than_any_way_off_it(loss, direction, sign, pair):
+    truth = TRUTH.float()
+    off = truth.clone()
+    off[0, direction] += sign * (0.15 if direction < 3 else 0.03)
+    assert loss(truth, *pair, FINE).loss < 0.8 * loss(off, *pair, FINE).loss
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_descent_from_no_motion_finds_the_truth(loss, pair):
+    parameters = torch.zeros(1, 6, requires_grad=True)
+    optimizer = torch.optim.Adam([parameters], lr=0.02)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.95)
+    for _ in range(100):
+        optimizer.zero_grad()
+        loss(parameters, *pair, FINE).loss.backward()
+        optimizer.step()
+        schedule.step()
+    error = (parameters.detach() - TRUTH.float())[0]
+    assert error[:3].norm() < 0.03
+    assert error[3:].norm() < 0.005
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_pairs_of_a_batch_do_not_mix(loss, pair):
+    reference, target = pair
+    full = (reference, target)
+    half = (reference * (torch.arange(FINE.width) < 120), target)  # far fewer activated pixels
+    parameters = torch.tensor([[0.1, 0, 0, 0, 0, 0.01], [0.2, 0.1, 0, 0, 0, 0]])
+    together = loss(parameters, torch.cat([full[0], half[0]]), torch.cat([full[1], half[1]]), FINE)
+    alone = [loss(parameters[i : i + 1], *p, FINE) for i, p in enumerate((full, half))]
+    torch.testing.assert_close(together.loss, (alone[0].loss + alone[1].loss) / 2)
+    for part in together.parts:
+        torch.testing.assert_close(together.parts[part], (alone[0].parts[part] + alone[1].parts[part]) / 2)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_one_pair_without_overlap_costs_nothing_and_pulls_nowhere(loss, pair):
+    reference = torch.cat([pair[0], torch.zeros_like(pair[0])])
+    target = torch.cat([pair[1], pair[1]])
+    parameters = torch.zeros(2, 6, requires_grad=True)
+    result = loss(parameters, reference, target, FINE)
+    result.loss.backward()
+    torch.testing.assert_close(result.loss, loss(torch.zeros(1, 6), *pair, FINE).loss / 2)
+    assert parameters.grad[0].abs().sum() > 0
+    assert (parameters.grad[1] == 0).all()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("far_off", [0.0, 1e4])
+def test_without_any_overlap_loss_and_gradient_are_zero(loss, far_off, pair):
+    target = pair[1] if far_off else torch.zeros_like(pair[1])
+    parameters = torch.tensor([[0.0, 0, far_off, 0, 0, 0]], requires_grad=True)
+    result = loss(parameters, pair[0], target, FINE)
+    result.loss.backward()
+    assert result.loss == 0 and result.parts["activated_share"] == 0
+    assert (parameters.grad == 0).all()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_unused_pixels_do_not_matter(loss, pair):
+    """Reference points without a normal can lie anywhere."""
+    reference, target = pair
+    lone = ~activated(normal_map(reference))
+    holes = torch.where(lone[:, None], 0.0, reference)
+    parameters = TRUTH.float()
+    assert lone.any()
+    torch.testing.assert_close(
+        loss(parameters, holes, target, FINE).loss, loss(parameters, reference, target, FINE).loss, rtol=0.2, atol=1e-4
+    )
+
+
+def test_icp_gradient_is_that_of_finite_differences(pair):
+    """In double precision, away from the truth where |r| has kinks, with the association fixed by tiny steps."""
+    reference, target = (m.double()[..., 8:24, :] for m in pair)
+    projection = type(SMALL)(
+        height=16, width=360, fov_up_deg=15.0 - 8 * 35 / 32, fov_down_deg=-20.0 + 8 * 35 / 32
+    )
+    start = (TRUTH * 0.5).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda p: IcpLoss()(p, reference, target, projection).loss, (start,), eps=1e-9, atol=1e-4, rtol=1e-3
+    )
+
+
+def test_weighted_gradient_is_that_of_reweighted_least_squares(pair):
+    """The weights are held: d/dp of w0 r(p)^2 with w0 taken at p."""
+    reference, target = (m.double() for m in pair)
+    loss = WeightedIcpLoss(sigma_m=0.5)
+    start = TRUTH * 0.5
+    parameters = start.clone().requires_grad_()
+    loss(parameters, reference, target, FINE).loss.backward()
+
+    normals = normal_map(reference)
+    at_start = reproject(se3.from_euler(start), target, FINE)
+    weights = (-(at_start - reference).square().sum(1) / 0.5**2).exp()
+    used = activated(reference) & activated(at_start) & activated(normals)
+
+    def energy(p):
+        residuals = ((reproject(se3.from_euler(p), target, FINE) - reference) * normals).sum(1)
+        return (weights * residuals.square())[used].mean()
+
+    step = 1e-7 * torch.eye(6, dtype=torch.float64)
+    numeric = torch.stack([(energy(start + s) - energy(start - s)) / 2e-7 for s in step])
+    torch.testing.assert_close(parameters.grad[0], numeric, atol=1e-5, rtol=1e-3)
+
+
+def test_icp_is_the_mean_distance_to_the_floor():
+    """Closed form: a plane lifted by 0.1 m is 0.1 m from itself wherever the association is."""
+    x, y = torch.meshgrid(torch.linspace(-20, 20, 400), torch.linspace(-20, 20, 400), indexing="ij")
+    floor = FINE.vertex_map(torch.stack([x, y, torch.full_like(x, -1.7)], dim=-1).reshape(-1, 3))[None]
+    lifted = torch.tensor([[0.0, 0, 0.1, 0, 0, 0]])
+    result = IcpLoss()(lifted, floor, floor, FINE)
+    assert float(result.loss) == pytest.approx(0.1, abs=1e-3)
+    assert float(result.parts["residual_m"]) == pytest.approx(0.1, abs=1e-3)
+
+
+@pytest.mark.parametrize(("distance", "weight"), [(0.0, 1.0), (0.5, 0.36788), (1.0, 0.018316)])
+def test_weights_of_associations(distance, weight):
+    rho = WeightedIcpLoss(sigma_m=0.5).rho(torch.tensor(0.2), torch.tensor(distance**2))
+    assert float(rho) == pytest.approx(weight * 0.04, rel=1e-4)
+
+
+def test_reprojection_by_the_identity_changes_nothing(pair):
+    torch.testing.assert_close(reproject(se3.identity(1), pair[0], FINE), pair[0])
+
+
+def test_empty_pixels_do_not_become_points():
+    target = torch.zeros(1, 3, FINE.height, FINE.width)
+    assert not reproject(se3.from_euler(torch.ones(1, 6)), target, FINE).any()

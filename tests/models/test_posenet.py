@@ -1,0 +1,78 @@
+"""PoseNet: what goes in, what comes out, and the seam."""
+
+import pytest
+import torch
+from torch import nn
+
+from lidarlearn.models.posenet import ColumnWrappedConv2d, PoseNet
+from tests.box_world import SMALL, cast
+from lidarlearn.geometry import se3
+
+
+@pytest.fixture(scope="module")
+def vertex_map():
+    return SMALL.vertex_map(cast(se3.identity()))[None]
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("size", [(16, 96), (32, 90), (64, 45)])
+def test_six_parameters_for_any_image(batch, size):
+    network = PoseNet().eval()
+    maps = torch.randn(batch, 3, *size)
+    assert network(maps, maps).shape == (batch, 6)
+
+
+def test_the_untrained_network_says_hardly_any_motion(vertex_map):
+    torch.manual_seed(0)
+    parameters = PoseNet()(vertex_map.expand(4, -1, -1, -1), vertex_map.expand(4, -1, -1, -1))
+    assert parameters[:, :3].abs().max() < 0.3
+    assert parameters[:, 3:].abs().max() < 0.03
+
+
+def test_it_tells_reference_from_target(vertex_map):
+    network = PoseNet().eval()
+    other = vertex_map.roll(3, dims=-1)
+    assert not torch.allclose(network(vertex_map, other), network(other, vertex_map))
+
+
+def test_the_rotation_head_is_scaled(vertex_map):
+    torch.manual_seed(0)
+    plain = PoseNet(rotation_scale=1.0).eval()
+    scaled = PoseNet(rotation_scale=0.1).eval()
+    scaled.load_state_dict(plain.state_dict())
+    a, b = plain(vertex_map, vertex_map), scaled(vertex_map, vertex_map)
+    torch.testing.assert_close(b[:, :3], a[:, :3])
+    torch.testing.assert_close(b[:, 3:], 0.1 * a[:, 3:])
+
+
+def test_only_the_ratio_of_coordinates_to_input_scale_counts(vertex_map):
+    near = PoseNet(input_scale_m=10.0).eval()
+    far = PoseNet(input_scale_m=20.0).eval()
+    far.load_state_dict(near.state_dict())
+    torch.testing.assert_close(far(2 * vertex_map, 2 * vertex_map), near(vertex_map, vertex_map))
+
+
+@pytest.mark.parametrize("backbone", ["resnet18", "resnet34", "resnet50"])
+def test_backbones(backbone, vertex_map):
+    assert PoseNet(backbone=backbone).eval()(vertex_map, vertex_map).shape == (1, 6)
+
+
+def test_wrapped_convolution_commutes_with_turning_the_image():
+    convolution = ColumnWrappedConv2d(2, 3, kernel_size=3, padding=1)
+    image = torch.randn(1, 2, 5, 8)
+    torch.testing.assert_close(convolution(image.roll(3, -1)), convolution(image).roll(3, -1))
+
+
+def test_wrapping_agrees_with_zero_padding_away_from_the_seam():
+    wrapped = ColumnWrappedConv2d(2, 3, kernel_size=3, padding=1)
+    plain = nn.Conv2d(2, 3, kernel_size=3, padding=1)
+    plain.load_state_dict(wrapped.state_dict())
+    image = torch.randn(1, 2, 5, 8)
+    torch.testing.assert_close(wrapped(image)[..., 1:-1], plain(image)[..., 1:-1])
+
+
+def test_wrapping_replaces_every_convolution_with_padding_and_keeps_parameter_names():
+    plain, wrapped = PoseNet(wrap_columns=False), PoseNet(wrap_columns=True)
+    assert plain.state_dict().keys() == wrapped.state_dict().keys()
+    padded = [m for m in wrapped.modules() if isinstance(m, nn.Conv2d) and m.padding[1] > 0]
+    assert len(padded) == 17 and all(isinstance(m, ColumnWrappedConv2d) for m in padded)
