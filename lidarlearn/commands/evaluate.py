@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from lidarlearn.evaluation.report import print_tables, write_report
 from lidarlearn.evaluation.run import Export, RunProgress, read_export, run_odometry
 from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.trajectories import find_trajectories, read_trajectory, to_lidar_frame
-from lidarlearn.odometry.odometry import InitializationAlone, ScanByScan
+from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
 from lidarlearn.training.checkpoints import load_checkpoint, sha256
 from lidarlearn.training.parts import require_trusted
 
@@ -105,7 +106,7 @@ def _own(
                 export = Export(run_folder / "trajectories" / str(method), sequence.name)
                 task = progress.start(str(method), sequence)
                 odometry = build_odometry(config, method)
-                run_odometry(odometry, sequence, export, config.data.deskew, lambda t=task: progress.advance(t))
+                run_odometry(odometry, sequence, export, config.data.deskew, partial(progress.advance, task))
                 T_world_lidar, summary = read_export(export, sequence)
                 health = summary["health"]
                 progress.done(task, str(method), sequence, summary["frames_per_second"], health["flagged"])
@@ -166,7 +167,7 @@ def _device(name: str) -> str:
 
 def _seed(seed: int) -> None:
     torch.manual_seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - what OpenCV-era libraries draw from
+    np.random.seed(seed)
 
 
 def _protocol(config: DictConfig, data_name: str) -> dict[str, Any]:

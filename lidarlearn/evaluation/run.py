@@ -24,7 +24,7 @@ from lidarlearn.evaluation.trajectories import (
     write_tum,
 )
 from lidarlearn.odometry.health import Health, write_health
-from lidarlearn.odometry.odometry import ScanByScan
+from lidarlearn.odometry.scan_by_scan import ScanByScan
 
 
 @dataclass(frozen=True)
@@ -161,9 +161,7 @@ def summarize_health(records: Iterable[Health]) -> dict[str, float | int | None]
     }
 
 
-def _write(
-    export: Export, sequence: Sequence, poses: list[Tensor], records: list[Health], seconds: float
-) -> None:
+def _write(export: Export, sequence: Sequence, poses: list[Tensor], records: list[Health], seconds: float) -> None:
     T_world = to_reference_frame(torch.stack(poses), sequence.T_reference_lidar)
     timestamps = None if sequence.timestamps is None else sequence.timestamps[: len(poses)]
     write_kitti(export.kitti, T_world)

@@ -1,0 +1,1 @@
+"""Rigid motions, spherical projection, normals and voxels: pure, batched functions on tensors."""

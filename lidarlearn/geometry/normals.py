@@ -158,7 +158,5 @@ def _longest_column(s: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3"]:
     xx, xy, xz, yy, yz, zz = s.unbind(-1)
     x_longest: Bool[Tensor, "*batch"] = (xx >= yy) & (xx >= zz)
     y_longest: Bool[Tensor, "*batch"] = yy >= zz
-    y_or_z = torch.where(
-        y_longest[..., None], torch.stack([xy, yy, yz], dim=-1), torch.stack([xz, yz, zz], dim=-1)
-    )
+    y_or_z = torch.where(y_longest[..., None], torch.stack([xy, yy, yz], dim=-1), torch.stack([xz, yz, zz], dim=-1))
     return torch.where(x_longest[..., None], torch.stack([xx, xy, xz], dim=-1), y_or_z)

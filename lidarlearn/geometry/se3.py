@@ -53,7 +53,7 @@ def transform(T_target_source: Float[Tensor, "*#batch 4 4"], points: Float[Tenso
 
 
 def hat(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The matrix of the cross product: hat(v) w = v x w."""
+    """The matrix W of the cross product, W w = v x w."""
     x, y, z = v.unbind(-1)
     o = torch.zeros_like(x)
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))

@@ -2,9 +2,11 @@
 
 from lidarlearn.odometry.backend import Backend
 from lidarlearn.odometry.health import Health
+from lidarlearn.odometry.judgement import Judgement
 from lidarlearn.odometry.local_map import LocalMap
-from lidarlearn.odometry.odometry import Frame, InitializationAlone, Judgement, Odometry, ScanByScan
+from lidarlearn.odometry.odometry import Odometry
 from lidarlearn.odometry.sampling import GridSampling, ImageSampling
+from lidarlearn.odometry.scan_by_scan import Frame, InitializationAlone, ScanByScan
 
 __all__ = [
     "Backend",

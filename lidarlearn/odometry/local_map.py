@@ -53,5 +53,3 @@ class LocalMap:
         moved = se3.log(se3.inverse(self._T_world_key) @ T_world_lidar)
         distance, angle = moved[:3].norm().item(), math.degrees(moved[3:].norm().item())
         return distance >= self._key_frame_distance_m or angle >= self._key_frame_angle_deg
-
-

@@ -1,9 +1,8 @@
 """The odometry: one pose per scan, from an initialization and a registration backend."""
 
 import math
-from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -11,88 +10,12 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.odometry.backend import Backend, PreparedScan
-from lidarlearn.odometry.health import Health
+from lidarlearn.odometry.health import Health, Status
 from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
 from lidarlearn.odometry.initialization.base import Initialization
+from lidarlearn.odometry.judgement import Judgement, motion_difference
+from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
 from lidarlearn.registration.gauss_newton import RegistrationResult
-
-
-@dataclass(frozen=True)
-class Frame:
-    """A scan's place in the trajectory.
-
-    Args:
-        T_world_lidar: its pose, float64; the first one is the identity.
-        health: whether to trust it.
-    """
-
-    T_world_lidar: Float[Tensor, "4 4"]
-    health: Health
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """When a registration is doubted.
-
-    Args:
-        min_points: fewest points that can be registered.
-        min_overlap: smallest acceptable share of points that have a neighbour in the map.
-        min_inlier_share: smallest acceptable share of those that fit it.
-        min_information: the weakest direction counts as degenerate below it, see `RegistrationResult.information`.
-        max_deviation_m: largest plausible change of motion from one scan to the next [m]; 0.5 m at 10 Hz is an
-            acceleration of 50 m/s^2.
-        max_deviation_deg: largest plausible change of rotation from one scan to the next [deg].
-        restart_after: with so many scans in a row without an acceptable registration the map is begun anew.
-    """
-
-    min_points: int = 100
-    min_overlap: float = 0.1
-    min_inlier_share: float = 0.6
-    min_information: float = 0.005
-    max_deviation_m: float = 0.5
-    max_deviation_deg: float = 8.0
-    restart_after: int = 5
-
-
-class ScanByScan(ABC):
-    """Anything that takes scans in order and says where they were taken."""
-
-    @abstractmethod
-    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
-        """Find the pose of the next scan.
-
-        Args:
-            points: the scan [m], in the sensor's frame; may be empty or hold values that are not finite.
-            times: when each point was measured, to compensate the motion within the scan; see
-                `lidarlearn.data.sequence.Scan`. None where there is nothing to compensate.
-        """
-
-
-class InitializationAlone(ScanByScan):
-    """Accumulates the guesses of an initialization, without any registration.
-
-    Args:
-        initialization: what guesses.
-        device: where it runs.
-    """
-
-    def __init__(self, initialization: Initialization, device: torch.device | str = "cpu") -> None:
-        self._initialization = initialization
-        self._device = torch.device(device)
-        self._motion = se3.identity(device=self._device)
-        self._T_world_lidar = se3.identity(device=self._device)
-        self._frames = 0
-
-    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
-        """The previous pose and the guessed motion."""
-        points = points.to(self._device)
-        guess = self._initialization.predict(points[points.isfinite().all(dim=1)], self._motion)
-        if self._frames:
-            self._motion = guess.T_previous_new
-            self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ self._motion)
-        self._frames += 1
-        health = Health(self._frames - 1, initialization=guess.source, points=len(points))
-        return Frame(self._T_world_lidar.cpu(), health)
 
 
 class Odometry(ScanByScan):
@@ -158,7 +81,7 @@ class Odometry(ScanByScan):
 
     def _begin(self, scan: PreparedScan) -> Health:
         """Start a map with a scan, at the origin or, after a loss, where the motion model puts it."""
-        status = "ok" if self._frames == 0 else "restarted"
+        status: Status = "ok" if self._frames == 0 else "restarted"
         if self._frames:
             self._move(self._motion)
         if self._has_enough_points(scan):
@@ -172,13 +95,13 @@ class Odometry(ScanByScan):
             return self._coast(Health(self._frames, initialization=source, points=len(scan.points), overlap=0.0))
         result = self._register(scan, T_previous_new)
         health = self._assess(scan, result, source)
-        if self._recovery and source != "start" and (health.implausible or not self._accepts(result)):
+        if self._recovery and source != "start" and (health.implausible or not self._judgement.accepts(result)):
             hypotheses = surprise_motions(T_previous_new, self._motion)
             second = self._register(scan, self._search(scan, hypotheses))
             if second.fit > result.fit:
                 result, health = second, self._assess(scan, second, "recovery")
             health = replace(health, status="recovered")
-        if not self._accepts(result):
+        if not self._judgement.accepts(result):
             return self._coast(health)
         self._surprises_m.append(self._displacement_m(scan, T_previous_new, result.T_world_lidar))
         self._trust(self._motion_to(result.T_world_lidar), health)
@@ -204,7 +127,7 @@ class Odometry(ScanByScan):
     def _trust(self, motion: Tensor, health: Health) -> None:
         """Move, and take over the motion as the model of the next one if it is plausible or seen twice."""
         self._move(motion)
-        confirmed = self._doubted_motion is not None and self._is_plausible(self._doubted_motion, motion)
+        confirmed = self._doubted_motion is not None and self._judgement.is_plausible(self._doubted_motion, motion)
         if self._frames == 1 or not health.implausible or confirmed:
             self._motion, self._doubted_motion = motion, None
         else:
@@ -214,7 +137,8 @@ class Odometry(ScanByScan):
         self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ motion)
 
     def _assess(self, scan: PreparedScan, result: RegistrationResult, source: str) -> Health:
-        deviation_m, deviation_deg = _difference(self._motion, self._motion_to(result.T_world_lidar))
+        motion = self._motion_to(result.T_world_lidar)
+        deviation_m, deviation_deg = motion_difference(self._motion, motion)
         information = result.information[0].item()
         return Health(
             frame=self._frames,
@@ -230,30 +154,16 @@ class Odometry(ScanByScan):
             weakest_direction=tuple(result.weakest_direction.tolist()),
             deviation_m=deviation_m,
             deviation_deg=deviation_deg,
-            implausible=self._frames > 1 and not self._is_plausible(self._motion, self._motion_to(result.T_world_lidar)),
+            implausible=self._frames > 1 and not self._judgement.is_plausible(self._motion, motion),
         )
-
-    def _accepts(self, result: RegistrationResult) -> bool:
-        judgement = self._judgement
-        return result.overlap.item() >= judgement.min_overlap and result.inlier_share.item() >= judgement.min_inlier_share
 
     def _has_enough_points(self, scan: PreparedScan) -> bool:
         return int(scan.is_query.sum()) >= self._judgement.min_points
-
-    def _is_plausible(self, before: Tensor, after: Tensor) -> bool:
-        deviation_m, deviation_deg = _difference(before, after)
-        return deviation_m <= self._judgement.max_deviation_m and deviation_deg <= self._judgement.max_deviation_deg
 
     def _motion_to(self, T_world_new: Tensor) -> Tensor:
         return se3.orthonormalize(se3.inverse(self._T_world_lidar) @ T_world_new)
 
     def _displacement_m(self, scan: PreparedScan, T_previous_new: Tensor, T_world_new: Tensor) -> float:
         """How far a point at the mean range was from where the guess had it."""
-        shift_m, angle_deg = _difference(T_previous_new, self._motion_to(T_world_new))
+        shift_m, angle_deg = motion_difference(T_previous_new, self._motion_to(T_world_new))
         return shift_m + math.radians(angle_deg) * scan.points.norm(dim=1).mean().item()
-
-
-def _difference(T_a: Tensor, T_b: Tensor) -> tuple[float, float]:
-    """Distance [m] and angle [deg] between two motions."""
-    xi = se3.log(se3.inverse(T_a) @ T_b)
-    return xi[:3].norm().item(), math.degrees(xi[3:].norm().item())

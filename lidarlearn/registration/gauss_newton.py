@@ -11,7 +11,6 @@ from lidarlearn.registration.association.base import Association
 from lidarlearn.registration.residuals import PointToPlane, Residual
 from lidarlearn.registration.weights import Proximity, RobustWeight
 
-
 # A residual notices a move of 1 m if it changes by more than this [m]: the sine of 17 deg, beyond the error of nearly
 # all normals.
 _NOTICEABLE = 0.3
@@ -123,8 +122,9 @@ class GaussNewton:
         """
         T = T_world_lidar
         converged = torch.zeros(T.shape[:-2], dtype=torch.bool, device=T.device)
-        distance, iteration = search_distance_m, 0
-        for iteration in range(1, self.max_iterations + 1):
+        distance, iterations = search_distance_m, 0
+        while iterations < self.max_iterations:
+            iterations += 1
             final = distance <= self.search_distance_m
             stride = 1 if final else self.coarse_stride
             used_normals = None if normals is None else normals[::stride]
@@ -139,7 +139,7 @@ class GaussNewton:
             distance *= self.narrowing
         T = se3.orthonormalize(T)
         system = self._linearize(points, association, T, self.search_distance_m, normals)
-        return _judge(T, iteration, converged, system, len(points))
+        return _judge(T, iterations, converged, system, len(points))
 
     def _linearize(
         self, points: Tensor, association: Association, T: Tensor, distance_m: float, normals: Tensor | None

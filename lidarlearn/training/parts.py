@@ -56,7 +56,9 @@ def require_trusted(node: object) -> None:
 
 def _trusted_class(name: object) -> type:
     if not isinstance(name, str) or not name.startswith(TRUSTED_PACKAGES):
-        raise UntrustedTargetError(f"_target_ {name!r} is not built: only classes of {', '.join(TRUSTED_PACKAGES)}* are")
+        raise UntrustedTargetError(
+            f"_target_ {name!r} is not built: only classes of {', '.join(TRUSTED_PACKAGES)}* are"
+        )
     module_name, _, attribute = name.rpartition(".")
     try:
         target = getattr(importlib.import_module(module_name), attribute)

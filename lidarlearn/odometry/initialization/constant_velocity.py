@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.odometry.initialization.base import InitialMotion, Initialization
+from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
 
 
 class ConstantVelocity(Initialization):

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.odometry.initialization.base import InitialMotion, Initialization
+from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
 from lidarlearn.odometry.initialization.constant_velocity import ConstantVelocity
 
 

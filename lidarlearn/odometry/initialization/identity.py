@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.odometry.initialization.base import InitialMotion, Initialization
+from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
 
 
 class NoInitialization(Initialization):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.odometry.initialization.base import InitialMotion, Initialization
+from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
 
 
 class TrainedNetwork(Protocol):

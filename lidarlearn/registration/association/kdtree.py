@@ -46,9 +46,7 @@ class KdTree(Association):
         if self._tree is None:
             # A sliding-midpoint tree is built four times faster than a balanced one and searched as fast.
             self._tree = cKDTree(self._map.points.cpu().numpy(), balanced_tree=False, compact_nodes=False)
-        distances, index = self._tree.query(
-            points_world.cpu().numpy(), distance_upper_bound=max_distance_m, workers=-1
-        )
+        distances, index = self._tree.query(points_world.cpu().numpy(), distance_upper_bound=max_distance_m, workers=-1)
         found = np.isfinite(distances)
         nearest = torch.from_numpy(np.where(found, index, 0)).to(self._device)
         mask = torch.from_numpy(found).to(self._device)

@@ -1,0 +1,49 @@
+"""When a registration is doubted."""
+
+import math
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.registration.gauss_newton import RegistrationResult
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """When a registration is doubted.
+
+    Args:
+        min_points: fewest points that can be registered.
+        min_overlap: smallest acceptable share of points that have a neighbour in the map.
+        min_inlier_share: smallest acceptable share of those that fit it.
+        min_information: the weakest direction counts as degenerate below it, see `RegistrationResult.information`.
+        max_deviation_m: largest plausible change of motion from one scan to the next [m]; 0.5 m at 10 Hz is an
+            acceleration of 50 m/s^2.
+        max_deviation_deg: largest plausible change of rotation from one scan to the next [deg].
+        restart_after: with so many scans in a row without an acceptable registration the map is begun anew.
+    """
+
+    min_points: int = 100
+    min_overlap: float = 0.1
+    min_inlier_share: float = 0.6
+    min_information: float = 0.005
+    max_deviation_m: float = 0.5
+    max_deviation_deg: float = 8.0
+    restart_after: int = 5
+
+    def accepts(self, result: RegistrationResult) -> bool:
+        """Whether enough of the scan fits the map."""
+        return result.overlap.item() >= self.min_overlap and result.inlier_share.item() >= self.min_inlier_share
+
+    def is_plausible(self, before: Float[Tensor, "4 4"], after: Float[Tensor, "4 4"]) -> bool:
+        """Whether one motion can follow the other."""
+        deviation_m, deviation_deg = motion_difference(before, after)
+        return deviation_m <= self.max_deviation_m and deviation_deg <= self.max_deviation_deg
+
+
+def motion_difference(T_a: Float[Tensor, "4 4"], T_b: Float[Tensor, "4 4"]) -> tuple[float, float]:
+    """Distance [m] and angle [deg] between two motions."""
+    xi = se3.log(se3.inverse(T_a) @ T_b)
+    return xi[:3].norm().item(), math.degrees(xi[3:].norm().item())

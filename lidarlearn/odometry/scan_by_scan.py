@@ -1,0 +1,66 @@
+"""What every odometry is: scans in, one by one, poses out."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.odometry.health import Health
+from lidarlearn.odometry.initialization.base import Initialization
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A scan's place in the trajectory.
+
+    Args:
+        T_world_lidar: its pose, float64; the first one is the identity.
+        health: whether to trust it.
+    """
+
+    T_world_lidar: Float[Tensor, "4 4"]
+    health: Health
+
+
+class ScanByScan(ABC):
+    """Anything that takes scans in order and says where they were taken."""
+
+    @abstractmethod
+    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+        """Find the pose of the next scan.
+
+        Args:
+            points: the scan [m], in the sensor's frame; may be empty or hold values that are not finite.
+            times: when each point was measured, to compensate the motion within the scan; see
+                `lidarlearn.data.sequence.Scan`. None where there is nothing to compensate.
+        """
+
+
+class InitializationAlone(ScanByScan):
+    """Accumulates the guesses of an initialization, without any registration.
+
+    Args:
+        initialization: what guesses.
+        device: where it runs.
+    """
+
+    def __init__(self, initialization: Initialization, device: torch.device | str = "cpu") -> None:
+        self._initialization = initialization
+        self._device = torch.device(device)
+        self._motion = se3.identity(device=self._device)
+        self._T_world_lidar = se3.identity(device=self._device)
+        self._frames = 0
+
+    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+        """The previous pose and the guessed motion."""
+        points = points.to(self._device)
+        guess = self._initialization.predict(points[points.isfinite().all(dim=1)], self._motion)
+        if self._frames:
+            self._motion = guess.T_previous_new
+            self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ self._motion)
+        self._frames += 1
+        health = Health(self._frames - 1, initialization=guess.source, points=len(points))
+        return Frame(self._T_world_lidar.cpu(), health)

@@ -1,0 +1,50 @@
+"""The odometries that users run, from the real configs, and short ways to feed them and to look at what they say."""
+
+from collections.abc import Iterable
+from functools import cache
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+from torch import Tensor
+
+from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.evaluate import build_odometry
+from lidarlearn.evaluation.methods import parse_method
+from lidarlearn.geometry import se3
+from lidarlearn.odometry.odometry import Frame, ScanByScan
+from lidarlearn.simulation.drive import Drive
+
+ASSOCIATIONS = ("kd", "vh", "p")
+
+
+def build(name: str, *overrides: str, projection: str = "hdl64") -> ScanByScan:
+    """A fresh odometry, e.g. "cv+kd_f2m", as `evaluate.py` builds it."""
+    return build_odometry(composed(f"projection@data.projection={projection}", *overrides), parse_method(name))
+
+
+@cache
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        return compose("evaluate", [*overrides, "device=cpu"])
+
+
+def run(odometry: ScanByScan, scans: Iterable[Tensor]) -> list[Frame]:
+    """One frame per scan."""
+    return [odometry.register_scan(points) for points in scans]
+
+
+def poses(frames: list[Frame]) -> Tensor:
+    """`T_world_lidar` of all frames (n, 4, 4)."""
+    return torch.stack([frame.T_world_lidar for frame in frames])
+
+
+def motion_errors(estimated: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
+    """Errors of the motions between consecutive poses: translations [m] and angles [deg]."""
+    T_error = se3.inverse(se3.relative(true)) @ se3.relative(estimated)
+    return T_error[:, :3, 3].norm(dim=1), se3.rotation_angle(T_error).rad2deg()
+
+
+def scans_of(drive: Drive) -> list[Tensor]:
+    """The points of all scans."""
+    return [drive.scan(i).points for i in range(len(drive))]
