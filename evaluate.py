@@ -1,4 +1,4 @@
-"""Evaluate odometries: `python evaluate.py [ckpt=...] [methods=[...]] [data=...]`; see README.md, configs/evaluate.yaml."""
+"""Evaluate odometries: `python evaluate.py [ckpt=...] [methods=[...]] [KEY=VALUE ...]`; see configs/evaluate.yaml."""
 
 from lidarlearn.commands.evaluate import main
 

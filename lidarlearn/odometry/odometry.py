@@ -53,6 +53,7 @@ class Odometry(ScanByScan):
         self._T_world_lidar = se3.identity(device=self._device)
         self._motion = se3.identity(device=self._device)  # last one that was trusted
         self._doubted_motion: Tensor | None = None
+        self._first: PreparedScan | None = None  # until the motion within it is known
         self._surprises_m: deque[float] = deque(maxlen=5)
         self._frames = 0
         self._coasting = 0
@@ -67,8 +68,10 @@ class Odometry(ScanByScan):
             health = self._begin(scan)
         else:
             T_previous_new, source = guess.T_previous_new, guess.source
-            if self._frames == 1 and self._recovery:
-                T_previous_new, source = self._search(scan, start_motions().to(self._device)), "start"
+            if self._frames == 1:
+                if self._recovery:
+                    T_previous_new, source = self._search(scan, start_motions().to(self._device)), "start"
+                self._deskew_first(scan, T_previous_new)
             health = self._advance(scan, T_previous_new, source)
         self._frames += 1
         return Frame(self._T_world_lidar.cpu(), health)
@@ -86,8 +89,19 @@ class Odometry(ScanByScan):
             self._move(self._motion)
         if self._has_enough_points(scan):
             self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
+            self._first = scan
             self._coasting = 0
         return Health(self._frames, status=status, points=len(scan.points))
+
+    def _deskew_first(self, scan: PreparedScan, T_previous_new: Tensor) -> None:
+        """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the trajectory."""
+        first, self._first = self._first, None
+        if first is None or first.times is None or not self._has_enough_points(scan):
+            return
+        result = self._register(scan, T_previous_new)
+        if self._judgement.accepts(result):
+            self._backend.local_map.restart()
+            self._backend.local_map.update(first.deskewed(self._motion_to(result.T_world_lidar)), self._T_world_lidar)
 
     def _advance(self, scan: PreparedScan, T_previous_new: Tensor, source: str) -> Health:
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""

@@ -78,6 +78,20 @@ class AggregatedPoints:
         same = (self._cells[index.clamp(min=0)] == cells).all(dim=-1)
         return torch.where(alive & same, index - self._start, -1)
 
+    def around(self, points_world: Float[Tensor, "m 3"], radius: int) -> Int[Tensor, "m c"]:
+        """Candidates for the neighbours of each point: what stands in the cube of 2 radius + 1 voxels around it.
+
+        Returns:
+            Indices into `points`. An empty voxel, or one whose slot another voxel took, gives a point from anywhere:
+            distances tell them apart, which is cheaper than to compare voxels.
+        """
+        cells = voxel_cells(points_world, self.voxel_size_m).int()
+        steps = torch.arange(-radius, radius + 1, dtype=torch.int32, device=self._device)
+        x, y, z = (_axis_slots(cells[:, axis, None] + steps, axis) for axis in range(3))
+        slots = (x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]).flatten()
+        index = self._table.index_select(0, slots).clamp(min=self._start) - self._start
+        return index.unflatten(0, (len(points_world), -1))
+
     def _forget(self, frames: int) -> None:
         dropped = max(len(self._frame_starts) - frames, 0)
         self._frame_starts = self._frame_starts[dropped:]
@@ -146,6 +160,10 @@ def _is_plane(
 
 
 def _slots(cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
-    bx, by, bz = _TABLE_BITS
-    x, y, z = cells.unbind(-1)
-    return ((x & ((1 << bx) - 1)) << (by + bz)) | ((y & ((1 << by) - 1)) << bz) | (z & ((1 << bz) - 1))
+    x, y, z = (_axis_slots(cells[..., axis], axis) for axis in range(3))
+    return x | y | z
+
+
+def _axis_slots(cells: Int[Tensor, "*batch"], axis: int) -> Int[Tensor, "*batch"]:
+    """The part of a table index that comes from one coordinate."""
+    return (cells & ((1 << _TABLE_BITS[axis]) - 1)) << sum(_TABLE_BITS[axis + 1 :])

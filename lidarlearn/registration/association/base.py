@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -20,6 +21,12 @@ class Correspondences:
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]
     mask: Bool[Tensor, "n"]
+
+
+def no_correspondences(points: Float[Tensor, "n 3"]) -> Correspondences:
+    """What an empty map answers."""
+    zeros = torch.zeros_like(points)
+    return Correspondences(zeros, zeros, torch.zeros(len(points), dtype=torch.bool, device=points.device))
 
 
 class Association(ABC):

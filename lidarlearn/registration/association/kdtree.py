@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.registration.association.aggregated_points import AggregatedPoints
-from lidarlearn.registration.association.base import Association, Correspondences
+from lidarlearn.registration.association.base import Association, Correspondences, no_correspondences
 
 
 class KdTree(Association):
@@ -43,6 +43,8 @@ class KdTree(Association):
 
     def search(self, points_world: Float[Tensor, "n 3"], max_distance_m: float) -> Correspondences:
         """The exact nearest neighbour within `max_distance_m`."""
+        if self.is_empty:
+            return no_correspondences(points_world)
         if self._tree is None:
             # A sliding-midpoint tree is built four times faster than a balanced one and searched as fast.
             self._tree = cKDTree(self._map.points.cpu().numpy(), balanced_tree=False, compact_nodes=False)

@@ -9,7 +9,7 @@ from torch import Tensor
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.normals import normal_map
 from lidarlearn.geometry.projection import SphericalProjection, activated
-from lidarlearn.registration.association.base import Association, Correspondences
+from lidarlearn.registration.association.base import Association, Correspondences, no_correspondences
 
 _NOTHING = torch.iinfo(torch.int64).max
 
@@ -58,6 +58,8 @@ class Projective(Association):
 
     def search(self, points_world: Float[Tensor, "n 3"], max_distance_m: float) -> Correspondences:
         """The closest map point of the same pixel within `max_distance_m`."""
+        if self.is_empty:
+            return no_correspondences(points_world)
         pixel = self.projection.pixel_index(se3.transform(self._T_lidar_world, points_world))
         candidates = self._layers[pixel.clamp(min=0)]
         squared = (self._points[candidates.clamp(min=0)] - points_world[:, None]).square().sum(-1)

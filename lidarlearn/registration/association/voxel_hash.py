@@ -3,13 +3,12 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.geometry.voxels import voxel_cells
-from lidarlearn.registration.association.aggregated_points import AggregatedPoints, neighbourhood
-from lidarlearn.registration.association.base import Association, Correspondences
+from lidarlearn.registration.association.aggregated_points import AggregatedPoints
+from lidarlearn.registration.association.base import Association, Correspondences, no_correspondences
 
 _CANDIDATES_AT_ONCE = 1 << 19  # bounds the memory of a wide search
 _MAX_RADIUS = 4  # cells; beyond, a search would visit more than 9^3 voxels per point
@@ -48,19 +47,18 @@ class VoxelHash(Association):
 
     def search(self, points_world: Float[Tensor, "n 3"], max_distance_m: float) -> Correspondences:
         """The nearest point of the voxels that the search distance reaches, up to four rings of them."""
+        if self.is_empty:
+            return no_correspondences(points_world)
         radius = min(math.ceil(max_distance_m / self._voxel_size_m), _MAX_RADIUS)
-        offsets = neighbourhood(radius, self._device)
-        chunks = points_world.split(max(_CANDIDATES_AT_ONCE // len(offsets), 1))
-        found = [self._nearest(chunk, offsets) for chunk in chunks]
+        chunks = points_world.split(max(_CANDIDATES_AT_ONCE // (2 * radius + 1) ** 3, 1))
+        found = [self._nearest(chunk, radius) for chunk in chunks]
         index = torch.cat([i for i, _ in found])
         squared = torch.cat([s for _, s in found])
         return Correspondences(self._map.points[index], self._map.normals[index], squared <= max_distance_m**2)
 
-    def _nearest(self, points: Float[Tensor, "n 3"], offsets: Tensor) -> tuple[Tensor, Tensor]:
-        cells = voxel_cells(points, self._voxel_size_m)
-        candidates = self._map.lookup(cells[:, None] + offsets)
-        squared = (self._map.points[candidates.clamp(min=0)] - points[:, None]).square().sum(-1)
-        squared = torch.where(candidates >= 0, squared, torch.inf)
-        best = squared.min(dim=1)
-        index = candidates.gather(1, best.indices[:, None])[:, 0].clamp(min=0)
-        return index, best.values
+    def _nearest(self, points: Float[Tensor, "n 3"], radius: int) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+        """Index of the nearest candidate of each point, and its squared distance."""
+        candidates = self._map.around(points, radius)
+        offsets = self._map.points.index_select(0, candidates.flatten()).view(*candidates.shape, 3) - points[:, None]
+        best = offsets.square().sum(-1).min(dim=1)
+        return candidates.gather(1, best.indices[:, None])[:, 0].long(), best.values

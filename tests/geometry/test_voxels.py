@@ -1,0 +1,56 @@
+import math
+
+import pytest
+import torch
+
+from lidarlearn.geometry.voxels import grid_sample, voxel_cells, voxel_keys
+
+
+def random_points(n: int, scale: float) -> torch.Tensor:
+    return scale * torch.randn(n, 3, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(("scale", "size"), [(1.0, 0.4), (20.0, 0.4), (20.0, 1.0), (80.0, 5.0)])
+def test_grid_sampling_keeps_one_point_of_every_voxel_in_the_order_of_the_scan(scale, size):
+    points = random_points(3000, scale)
+    occupied = {tuple(math.floor(x) for x in (point / size).tolist()) for point in points}
+    kept = grid_sample(points, size)
+    cells = [tuple(math.floor(x) for x in (point / size).tolist()) for point in points[kept]]
+    assert len(cells) == len(occupied) and set(cells) == occupied
+    assert (kept.diff() > 0).all()
+
+
+def test_which_point_is_kept_does_not_depend_on_its_place_in_the_scan():
+    """A spinning LiDAR lists its points beam by beam: the first of each voxel would lie on the same side of it."""
+    voxels, each = 400, 50
+    points = torch.arange(voxels).repeat(each)[:, None] + torch.full((1, 3), 0.5)
+    rank = grid_sample(points, 1.0) // voxels
+    assert len(rank) == voxels
+    assert rank.double().mean() == pytest.approx((each - 1) / 2, abs=4 * each / math.sqrt(12 * voxels))
+
+
+def test_cells_do_not_fold_around_the_origin():
+    points = torch.tensor([[-0.1, 0.1, -0.5], [0.1, -0.1, 0.5]])
+    assert voxel_cells(points, 0.4).tolist() == [[-1, 0, -2], [0, -1, 1]]
+
+
+def test_sampling_twice_changes_nothing():
+    points = random_points(2000, 10.0)
+    once = points[grid_sample(points, 0.5)]
+    assert torch.equal(grid_sample(once, 0.5), torch.arange(len(once)))
+
+
+def test_an_empty_scan_has_no_voxels():
+    assert grid_sample(torch.zeros(0, 3), 0.4).shape == (0,)
+
+
+def test_keys_are_one_to_one_within_a_million_cells():
+    edge = (1 << 20) - 1
+    values = torch.tensor([-edge - 1, -edge, -1, 0, 1, edge])
+    cells = torch.cartesian_prod(values, values, values)
+    assert len(voxel_keys(cells).unique()) == len(cells)
+
+
+def test_cells_take_any_batch_shape():
+    points = random_points(24, 5.0).view(2, 3, 4, 3)
+    assert torch.equal(voxel_cells(points, 0.3)[1, 2], voxel_cells(points[1, 2], 0.3))
