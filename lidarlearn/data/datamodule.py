@@ -72,12 +72,13 @@ class OdometryDataModule(LightningDataModule):
         train = [self.data.sequence(name) for name in self.data.train_sequences]
         # One sequence without ground truth and the batches of all go without: a batch holds the same for every pair.
         labelled = all(sequence.T_world_lidar is not None for sequence in train)
-        self._train_pairs = ConcatDataset([self._pairs(s, labelled, self.mirror) for s in train])
-        if not len(self._train_pairs):
+        pairs = [self._pairs(s, labelled, self.mirror) for s in train]
+        if not sum(map(len, pairs)):
             raise UserError(
                 f"{self.data.title}: no pair of scans to train on in sequences {list(self.data.train_sequences)}"
                 "\n  change: data.train_sequences, or data.max_frames"
             )
+        self._train_pairs = ConcatDataset(pairs)
         self.val_sequences = [self.data.sequence(name) for name in self.data.val_sequences]
         self._val_pairs = [self._pairs(s, s.T_world_lidar is not None, mirror=False) for s in self.val_sequences]
 

@@ -1,6 +1,6 @@
 """PoseNet: a residual network that regresses the relative pose of two scans from their vertex maps."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 import torchvision
@@ -8,7 +8,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from lidarlearn.geometry.projection import activated
+
 Backbone = Literal["resnet18", "resnet34", "resnet50"]
+Encoding = Literal["maps", "difference"]
 
 INITIAL_HEAD_STD = 1e-3  # the untrained network says "hardly any motion", from where projective association works
 
@@ -20,7 +23,13 @@ class PoseNet(nn.Module):
 
     Args:
         backbone: one of torchvision's residual networks, with random weights.
+        encoding: "maps" stacks the two vertex maps as in the paper. "difference" puts in the target's place what it
+            differs by from the reference: motion moves points by decimetres that lie tens of metres away, and a network
+            that gets only the two positions spends most of a short training on learning to subtract them (simulated
+            town, 3 epochs: 54 % of the motion wrong as against 20 %).
         input_scale_m: coordinates are divided by this, so that the network sees numbers around one [m].
+        difference_scale_m: length at which a difference counts half of what it can at most [m]; beyond, it stands for
+            a change of surface rather than for motion. Of no effect on "maps".
         rotation_scale: factor of the rotation head. Angles between scans are an order of magnitude smaller than
             translations in metres; without the factor early steps rotate scans out of each other's view.
         wrap_columns: pad convolutions with the columns from beyond the seam instead of zeros.
@@ -33,12 +42,18 @@ class PoseNet(nn.Module):
     def __init__(
         self,
         backbone: Backbone = "resnet18",
+        encoding: Encoding = "difference",
         input_scale_m: float = 20.0,
+        difference_scale_m: float = 2.0,
         rotation_scale: float = 0.1,
         wrap_columns: bool = True,
     ) -> None:
         super().__init__()
+        if encoding not in get_args(Encoding):
+            raise ValueError(f"encoding is one of {', '.join(get_args(Encoding))}, got {encoding!r}")
+        self.encoding = encoding
         self.input_scale_m = input_scale_m
+        self.difference_scale_m = difference_scale_m
         network = torchvision.models.get_model(backbone, weights=None, num_classes=6)
         network.conv1 = nn.Conv2d(6, network.conv1.out_channels, kernel_size=7, stride=2, padding=3, bias=False)
         nn.init.normal_(network.fc.weight, std=INITIAL_HEAD_STD)
@@ -57,7 +72,21 @@ class PoseNet(nn.Module):
             reference: vertex map of the earlier scan [m], zeros where no point fell.
             target: vertex map of the new scan [m], likewise, each in its own sensor frame.
         """
-        return self.network(torch.cat([reference, target], dim=1) / self.input_scale_m) * self.output_scale
+        first = reference / self.input_scale_m
+        if self.encoding == "maps":
+            second = target / self.input_scale_m
+        else:
+            second = bounded_difference(reference, target, self.difference_scale_m)
+        return self.network(torch.cat([first, second], dim=1)) * self.output_scale
+
+
+def bounded_difference(
+    reference: Float[Tensor, "batch 3 h w"], target: Float[Tensor, "batch 3 h w"], scale_m: float
+) -> Float[Tensor, "batch 3 h w"]:
+    """Target minus reference, pixel by pixel, as d / (scale + |d|): shorter than one; zero where either is empty."""
+    both = (activated(reference) & activated(target))[:, None]
+    d = torch.where(both, target - reference, 0.0)
+    return d / (scale_m + d.norm(dim=1, keepdim=True))
 
 
 class ColumnWrappedConv2d(nn.Conv2d):

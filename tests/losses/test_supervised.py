@@ -45,8 +45,8 @@ def test_the_best_weights_are_the_precisions():
         result = loss(estimate, se3.from_euler(truth))
         result.loss.backward()
         optimizer.step()
-    assert float(loss.s1) == pytest.approx(-math.log(result.parts["translation_squared_m2"]), abs=0.02)
-    assert float(loss.s2) == pytest.approx(-math.log(result.parts["rotation_squared_rad2"]), abs=0.02)
+    assert loss.s1.item() == pytest.approx(-math.log(result.parts["translation_squared_m2"].item()), abs=0.02)
+    assert loss.s2.item() == pytest.approx(-math.log(result.parts["rotation_squared_rad2"].item()), abs=0.02)
 
 
 def test_weights_stop_growing_where_nothing_is_left_to_learn():
@@ -55,5 +55,5 @@ def test_weights_stop_growing_where_nothing_is_left_to_learn():
     estimate = truth.float().requires_grad_()
     result = loss(estimate, se3.from_euler(truth))
     result.loss.backward()
-    assert float(result.loss) == pytest.approx(-28.0, abs=0.01)
+    assert result.loss.item() == pytest.approx(-28.0, abs=0.01)
     assert loss.s1.grad == 0 and loss.s2.grad == 0

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from lidarlearn.models.posenet import ColumnWrappedConv2d, PoseNet
+from lidarlearn.models.posenet import ColumnWrappedConv2d, PoseNet, bounded_difference
 from tests.box_world import SMALL, cast
 from lidarlearn.geometry import se3
 
@@ -45,11 +45,19 @@ def test_the_rotation_head_is_scaled(vertex_map):
     torch.testing.assert_close(b[:, 3:], 0.1 * a[:, 3:])
 
 
-def test_only_the_ratio_of_coordinates_to_input_scale_counts(vertex_map):
-    near = PoseNet(input_scale_m=10.0).eval()
-    far = PoseNet(input_scale_m=20.0).eval()
+@pytest.mark.parametrize("encoding", ["maps", "difference"])
+def test_only_the_ratio_of_coordinates_to_input_scales_counts(encoding, vertex_map):
+    near = PoseNet(encoding=encoding, input_scale_m=10.0, difference_scale_m=1.0).eval()
+    far = PoseNet(encoding=encoding, input_scale_m=20.0, difference_scale_m=2.0).eval()
     far.load_state_dict(near.state_dict())
     torch.testing.assert_close(far(2 * vertex_map, 2 * vertex_map), near(vertex_map, vertex_map))
+
+
+def test_the_difference_of_two_maps():
+    reference = torch.tensor([[10.0, 10, 0, 5], [0, 0, 0, 5], [0, 0, 0, 5]])[None, :, None]
+    target = torch.tensor([[12.0, 110, 7, 0], [0, 0, 0, 0], [0, 0, 0, 0]])[None, :, None]
+    difference = bounded_difference(reference, target, scale_m=2.0)
+    torch.testing.assert_close(difference[0, :, 0], torch.tensor([[0.5, 100 / 102, 0, 0], [0.0] * 4, [0.0] * 4]))
 
 
 @pytest.mark.parametrize("backbone", ["resnet18", "resnet34", "resnet50"])

@@ -40,7 +40,7 @@ class Projective(Association):
     @property
     def is_empty(self) -> bool:
         """Whether there is nothing to search in."""
-        return not self._frames
+        return not any(len(points) for points, _ in self._frames)
 
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
         """Add a registered scan and project the whole map into its image."""

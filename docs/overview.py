@@ -1,0 +1,77 @@
+"""The README's picture: a scan as PoseNet sees it, and the map that an odometry makes of a drive.
+
+Writes docs/images/overview.png from a simulated drive.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from lidarlearn.geometry.normals import normal_map
+from lidarlearn.geometry.projection import SphericalProjection, activated
+from lidarlearn.geometry.se3 import transform
+from lidarlearn.odometry import Backend, GridSampling, LocalMap, Odometry
+from lidarlearn.odometry.initialization import ConstantVelocity
+from lidarlearn.registration.association import KdTree
+from lidarlearn.simulation.drive import Drive
+
+_PATH = Path(__file__).parent / "images" / "overview.png"
+_SHOWN = 40  # the scan shown as an image
+
+
+def main() -> None:
+    """Drive, register, draw."""
+    drive = Drive("urban", seed=7, frames=220)
+    odometry = Odometry(ConstantVelocity(), Backend(GridSampling(), LocalMap(KdTree())))
+    poses = torch.stack([odometry.register_scan(scan.points).T_world_lidar for scan in drive])
+    figure = Figure(figsize=(11, 6.4), dpi=110, layout="constrained")
+    world, ranges, normals = figure.subplots(3, 1, gridspec_kw={"height_ratios": [6, 1, 1]})
+    _draw_map(world, drive, poses)
+    vertices = SphericalProjection().vertex_map(drive.scan(_SHOWN).points)
+    _draw_image(ranges, _range_colours(vertices), "vertex map, coloured by range")
+    _draw_image(normals, _normal_colours(vertices), "normal map")
+    figure.savefig(_PATH)
+
+
+def _draw_map(axes: Axes, drive: Drive, poses: Tensor) -> None:
+    scans = {i: drive.scan(i).points[::5] for i in range(0, len(poses), 4)}
+    scans = {i: points[(points[:, 2] > -1.5) & (points[:, 2] < 8)] for i, points in scans.items()}  # without the ground
+    heights = torch.cat([points[:, 2] for points in scans.values()])
+    order = heights.argsort()
+    points = torch.cat([transform(poses[i], points) for i, points in scans.items()])[order]
+    axes.scatter(points[:, 0], points[:, 1], c=heights[order], s=0.15, cmap="viridis", linewidths=0, rasterized=True)
+    axes.plot(poses[:, 0, 3], poses[:, 1, 3], color="#d55e00", linewidth=2, label="cv+kd_f2m")
+    assert drive.T_world_lidar is not None
+    truth = drive.T_world_lidar
+    axes.plot(truth[:, 0, 3], truth[:, 1, 3], color="black", linewidth=1, linestyle="--", label="ground truth")
+    axes.set_aspect("equal")
+    margin = torch.tensor([75.0, 25.0])
+    low, high = poses[:, :2, 3].amin(0) - margin, poses[:, :2, 3].amax(0) + margin
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
+    axes.legend(loc="upper left", frameon=True)
+
+
+def _draw_image(axes: Axes, image: np.ndarray, title: str) -> None:
+    axes.imshow(image, aspect="auto", interpolation="nearest")
+    axes.set_title(title, fontsize=9, loc="left")
+    axes.set_axis_off()
+
+
+def _range_colours(vertices: Tensor) -> np.ndarray:
+    ranges = vertices.norm(dim=0)
+    shade = (ranges.clamp(3, 60).log() - np.log(3)) / (np.log(60) - np.log(3))
+    return np.where(activated(vertices)[..., None], colormaps["turbo_r"](shade.numpy())[..., :3], 1.0)
+
+
+def _normal_colours(vertices: Tensor) -> np.ndarray:
+    normals = normal_map(vertices)
+    return np.where((normals != 0).any(dim=0)[..., None], (normals.movedim(0, -1).numpy() + 1) / 2, 1.0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""The cache of vertex maps: faithful, shared, and made again when it has to be."""
+
+import multiprocessing
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lidarlearn.data import cache
+from lidarlearn.data.cache import QUANTUM_M, cached_vertex_maps, decode, encode
+from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.sequence import Scan
+from lidarlearn.errors import UserError
+from lidarlearn.geometry.projection import SphericalProjection, activated
+from tests.box_world import SMALL, BoxSequence
+
+
+class CountingSequence(BoxSequence):
+    """Counts how often scans are read; one of them may be damaged, or the process may be interrupted there."""
+
+    def __init__(self, frames=7, damaged=None, interrupted=None):
+        super().__init__("1", frames)
+        self.read, self.damaged, self.interrupted = [], damaged, interrupted
+
+    def scan(self, index) -> Scan:
+        if index == self.damaged:
+            raise DamagedFileError(Path("scan.bin"), "it is truncated")
+        if index == self.interrupted:
+            raise KeyboardInterrupt
+        self.read.append(index)
+        return super().scan(index)
+
+
+def test_maps_are_those_of_the_scans_to_half_a_quantum(tmp_path):
+    sequence = BoxSequence("1", frames=4)
+    maps = cached_vertex_maps(sequence, SMALL, tmp_path)
+    assert len(maps) == 4 and maps[0].dtype == torch.int16
+    for i in range(4):
+        exact = SMALL.vertex_map(sequence.scan(i).points)
+        assert (decode(maps[i]) - exact).abs().max() <= QUANTUM_M / 2 + 1e-6
+        assert (activated(decode(maps[i])) == activated(exact)).all()
+
+
+def test_a_frame_of_the_paper_s_size_takes_280_kb_at_most(tmp_path):
+    cached_vertex_maps(BoxSequence("1", frames=3), SphericalProjection(), tmp_path)
+    assert sum(f.stat().st_size for f in tmp_path.rglob("*") if f.is_file()) <= 3 * 280_000
+
+
+def test_points_beyond_16_bits_become_empty_pixels():
+    vertex_map = torch.tensor([[131.0, 132.0, -200.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])[:, None]
+    kept = activated(decode(encode(vertex_map)))
+    assert kept.tolist() == [[True, False, False]]
+
+
+def test_scans_are_read_once(tmp_path):
+    sequence = CountingSequence()
+    cached_vertex_maps(sequence, SMALL, tmp_path)
+    cached_vertex_maps(sequence, SMALL, tmp_path)
+    assert sequence.read == list(range(7))
+
+
+def test_other_settings_make_another_cache(tmp_path):
+    sequence = CountingSequence(frames=3)
+    for projection in (SMALL, replace(SMALL, width=48), replace(SMALL, fov_up_deg=10.0)):
+        assert cached_vertex_maps(sequence, projection, tmp_path)[0].shape == (3, 16, projection.width)
+    longer = CountingSequence(frames=4)
+    cached_vertex_maps(longer, SMALL, tmp_path)
+    assert len(sequence.read) == 9 and len(longer.read) == 4
+
+
+def test_an_interrupted_cache_is_completed_and_what_was_done_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "_CHUNK", 2)
+    with pytest.raises(KeyboardInterrupt):
+        cached_vertex_maps(CountingSequence(interrupted=5), SMALL, tmp_path)
+    again = CountingSequence()
+    maps = cached_vertex_maps(again, SMALL, tmp_path)
+    assert again.read == [4, 5, 6]  # 0 to 3 were noted as done, in chunks of two
+    for i in range(7):
+        torch.testing.assert_close(maps[i], encode(SMALL.vertex_map(again.scan(i).points)))
+
+
+@pytest.mark.parametrize("file", ["vertex_maps.npy", "done.npy"])
+@pytest.mark.parametrize("left", [None, 0, 40])
+def test_a_lost_or_truncated_file_is_made_again(tmp_path, file, left):
+    cached_vertex_maps(CountingSequence(), SMALL, tmp_path)
+    path = next(tmp_path.rglob(file))
+    if left is None:
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:left])
+        if file == "vertex_maps.npy":
+            path.with_name("done.npy").unlink()
+    again = CountingSequence()
+    maps = cached_vertex_maps(again, SMALL, tmp_path)
+    torch.testing.assert_close(maps[6], encode(SMALL.vertex_map(again.scan(6).points)))
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # fork beside torch's threads, from Python 3.12 on
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_a_damaged_scan_is_named_also_from_a_worker(tmp_path, num_workers):
+    with pytest.raises(UserError, match=r"scan\.bin: it is truncated") as raised:
+        cached_vertex_maps(CountingSequence(damaged=3), SMALL, tmp_path, num_workers)
+    assert "Traceback" not in str(raised.value)
+
+
+def test_a_full_disk_is_told_before_it_kills(tmp_path, monkeypatch):
+    usage = type("usage", (), {"free": 1000})
+    monkeypatch.setattr(cache.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(UserError, match=r"datamodule\.cache_root"):
+        cached_vertex_maps(CountingSequence(), SMALL, tmp_path)
+
+
+def test_maps_travel_to_workers_as_a_path(tmp_path):
+    maps = cached_vertex_maps(BoxSequence("1", frames=30), SMALL, tmp_path)
+    luggage = pickle.dumps(maps)
+    assert len(luggage) < 2000
+    torch.testing.assert_close(pickle.loads(luggage)[29], maps[29])
+
+
+def _build(root, start, results):
+    torch.set_num_threads(1)
+    sequence = CountingSequence(frames=12)
+    start.wait()
+    maps = cached_vertex_maps(sequence, SMALL, root)
+    results.put((len(sequence.read), int(np.abs(maps[11].numpy()).sum())))
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # fork beside torch's threads, from Python 3.12 on
+def test_two_processes_at_once_share_the_work_and_the_result(tmp_path):
+    context = multiprocessing.get_context("fork")
+    start, results = context.Event(), context.Queue()
+    processes = [context.Process(target=_build, args=(tmp_path, start, results)) for _ in range(2)]
+    for process in processes:
+        process.start()
+    start.set()
+    (read_a, sum_a), (read_b, sum_b) = (results.get(timeout=60) for _ in range(2))
+    for process in processes:
+        process.join()
+    assert sorted([read_a, read_b]) == [0, 12]
+    assert sum_a == sum_b == int(encode(SMALL.vertex_map(BoxSequence("1", 12).scan(11).points)).int().abs().sum())
