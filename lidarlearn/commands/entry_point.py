@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import hydra
 from hydra.errors import HydraException, InstantiationException
-from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -16,7 +15,7 @@ from lidarlearn.errors import UserError
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 
 # Causes of a failed instantiation that a setting can mend; any other is a defect and keeps its stack trace.
-_SETTINGS_AT_FAULT = (UserError, TypeError, ValueError, ImportError, MisconfigurationException)
+_SETTINGS_AT_FAULT = (UserError, TypeError, ValueError, ImportError)
 
 
 def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[[], None] = lambda: None) -> None:
@@ -63,15 +62,19 @@ def readable_message(error: Exception) -> str | None:
         return str(error)
     if isinstance(error, InstantiationException):
         cause = error.__cause__
-        if not isinstance(cause, _SETTINGS_AT_FAULT):
+        if not isinstance(cause, _SETTINGS_AT_FAULT) and not _is_misconfiguration(cause):
             return None
         key = next((line for line in str(error).splitlines() if line.startswith("full_key:")), "")
-        reason = str(cause) if isinstance(cause, UserError | MisconfigurationException) else f"{cause}"
-        return "  ".join(part for part in (reason, key.replace("full_key:", "in the config node")) if part)
+        return "  ".join(part for part in (str(cause), key.replace("full_key:", "in the config node")) if part)
     if isinstance(error, HydraException | OmegaConfBaseException):
         lines = [line.strip() for line in str(error).splitlines()]
         return "  ".join(line for line in lines if line and not line.startswith(("See https", "object_type=", "^")))
     return None
+
+
+def _is_misconfiguration(error: BaseException | None) -> bool:
+    """Whether Lightning says so; told by name, since importing it takes seconds that an evaluation can do without."""
+    return any(base.__name__ == "MisconfigurationException" for base in type(error).__mro__)
 
 
 def _application(task: Callable[[DictConfig], None], config_name: str) -> Callable[[], None]:

@@ -8,6 +8,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 import lidarlearn
@@ -67,7 +68,7 @@ def evaluate_command(checkpoint: Path) -> str:
 
 def _train_and_say_what_next(config: DictConfig) -> None:
     checkpoint = train(config, HydraConfig.get().runtime.choices["data"]).resolve()
-    if checkpoint.exists():
+    if rank_zero_only.rank == 0 and checkpoint.exists():
         print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
         print(f"next:       {evaluate_command(checkpoint)}")
 

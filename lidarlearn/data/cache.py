@@ -128,7 +128,10 @@ def _build(folder: Path, sequence: Sequence, projection: SphericalProjection, nu
     )
     missing = np.flatnonzero(~done).tolist()
     scans = DataLoader(
-        _ProjectedScans(sequence, projection, missing), batch_size=None, num_workers=min(num_workers, len(missing))
+        _ProjectedScans(sequence, projection, missing),
+        batch_size=None,
+        num_workers=min(num_workers, len(missing)),
+        generator=torch.Generator(),  # leaves the global one alone: a training is the same with or without a cache
     )
     finished: list[int] = []
     for index, vertex_map in track(scans, f"projecting sequence {sequence.name}", total=len(missing)):

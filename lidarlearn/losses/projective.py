@@ -1,6 +1,7 @@
 """Unsupervised training: point-to-plane alignment under projective association."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -31,7 +32,7 @@ class ProjectiveLoss(nn.Module, ABC):
     """
 
     def __init__(
-        self, normal_window: tuple[int, int] = (3, 3), max_range_jump: float = 0.15, max_roughness: float = 0.2
+        self, normal_window: Sequence[int] = (3, 3), max_range_jump: float = 0.15, max_roughness: float = 0.2
     ) -> None:
         super().__init__()
         self.normal_window = (int(normal_window[0]), int(normal_window[1]))

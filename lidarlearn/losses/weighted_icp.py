@@ -1,5 +1,7 @@
 """The paper's weighted ICP loss."""
 
+from collections.abc import Sequence
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -25,7 +27,7 @@ class WeightedIcpLoss(ProjectiveLoss):
     def __init__(
         self,
         sigma_m: float = 0.5,
-        normal_window: tuple[int, int] = (3, 3),
+        normal_window: Sequence[int] = (3, 3),
         max_range_jump: float = 0.15,
         max_roughness: float = 0.2,
     ) -> None:

@@ -73,7 +73,8 @@ class GaussNewton:
         weight: the robust weight.
         max_iterations: steps at most.
         search_distance_m: correspondences are searched within this distance at the end [m].
-        narrowing: factor of the search distance from one iteration to the next, until it is `search_distance_m`.
+        narrowing: factor of the search distance from one iteration to the next, until it is `search_distance_m`; the
+            scale of the robust weight narrows with it (graduated non-convexity, Blake & Zisserman 1987).
         coarse_stride: while the search distance is wider, only every so manieth point is used.
         min_information: the position is left as initialized in directions of which the map says less than this, see
             `RegistrationResult.information`. Source: after Zhang, Kaess & Singh, "On degeneracy of optimization-based
@@ -151,7 +152,9 @@ class GaussNewton:
         mask = (found.mask & (found.normals != 0).any(dim=-1)).view(points_world.shape[:-1])
         linear = self.residual.linearize(T, points, points_world, map_points, map_normals, normals)
         size = linear.residuals.norm(dim=-1)
-        w = self.weight.weight(size, (points_world - map_points).square().sum(-1)) * mask
+        widening = distance_m / self.search_distance_m  # a narrow kernel would hold on to whatever is near by chance
+        squared_distances = (points_world - map_points).square().sum(-1)
+        w = self.weight.weight(size / widening, squared_distances / widening**2) * mask
         J = linear.jacobians.flatten(-3, -2)
         wJ = (linear.jacobians * w[..., None, None]).flatten(-3, -2)
         return _System(
@@ -219,10 +222,12 @@ class _Position:
 
 
 def _position(system: _System) -> _Position:
-    # A ridge far below any information keeps an empty system solvable: its gradient is zero and so is the step.
-    ridge = 1e-9 * system.H.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] + 1e-9
+    # A ridge far below any information keeps an empty system solvable, and above the rounding of single precision it
+    # holds what nothing is known of, such as the yaw on a bare plane.
+    blocks = system.H.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 3)).mean(-1)  # of translation and of rotation
+    ridge = torch.diag_embed(1e-6 * blocks.repeat_interleave(3, dim=-1) + 1e-9)
     # 6x6 and on the critical path: a GPU's solvers would cost more than the trip.
-    H = (torch.nan_to_num(system.H) + ridge * torch.eye(6, dtype=torch.float64, device=system.H.device)).cpu()
+    H = torch.nan_to_num(system.H + ridge).cpu()
     covariance = torch.linalg.inv(H)
     variances, directions = torch.linalg.eigh(covariance[..., :3, :3])
     variances, directions = variances.flip(-1), directions.flip(-1)

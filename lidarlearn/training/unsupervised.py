@@ -1,11 +1,15 @@
 """Training from scans alone."""
 
 from jaxtyping import Float
+from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
 from lidarlearn.data.pairs import Pair
 from lidarlearn.losses.result import LossResult
 from lidarlearn.training.module import PoseNetModule
+
+LEAST_ACTIVATED_SHARE = 0.02
+"""Share of used pixels below which the first batch of a training makes it warn; HDL-64 scans have about 0.4."""
 
 
 class UnsupervisedModule(PoseNetModule):
@@ -18,4 +22,13 @@ class UnsupervisedModule(PoseNetModule):
 
     def compute_loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
         """Point-to-plane alignment of the target with the reference."""
-        return self.loss(parameters, batch["reference"], batch["target"], self.projection)
+        result = self.loss(parameters, batch["reference"], batch["target"], self.projection)
+        if self.training and self.global_step == 0 and result.parts["activated_share"] < LEAST_ACTIVATED_SHARE:
+            p = self.projection
+            rank_zero_warn(
+                f"only {100 * float(result.parts['activated_share']):.1f} % of the {p.height}x{p.width} pixels hold a "
+                f"point of both scans and a normal: nothing can be learned from so few. Do scans fill an image of this "
+                f"size and field of view ({p.fov_up_deg:g} to {p.fov_down_deg:g} deg)? Change datamodule.height, "
+                "datamodule.width or data.projection"
+            )
+        return result

@@ -90,7 +90,7 @@ class AggregatedPoints:
         x, y, z = (_axis_slots(cells[:, axis, None] + steps, axis) for axis in range(3))
         slots = (x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]).flatten()
         index = self._table.index_select(0, slots).clamp(min=self._start) - self._start
-        return index.unflatten(0, (len(points_world), -1))
+        return index.view(len(points_world), len(steps) ** 3)
 
     def _forget(self, frames: int) -> None:
         dropped = max(len(self._frame_starts) - frames, 0)

@@ -1,0 +1,219 @@
+"""Registration on generated scenes: how far off it may start, what it says when it cannot know."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.registration.association.base import Association, Correspondences
+from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
+from lidarlearn.registration.residuals import GeneralizedIcp, PointToPlane, PointToPoint
+from lidarlearn.registration.weights import Cauchy, CutOff, GemanMcClure, Huber, NoWeight, Proximity
+from tests.registration import maps
+
+WIDE_M = 3.0
+KERNELS = [NoWeight(), Proximity(), Huber(), CutOff(), GemanMcClure(), Cauchy()]
+all_kernels = pytest.mark.parametrize("kernel", KERNELS, ids=lambda k: type(k).__name__)
+all_associations = pytest.mark.parametrize("association", maps.ASSOCIATIONS)
+all_scenes = pytest.mark.parametrize("name", ["room", "street"])
+
+
+def solver(association: str, **settings) -> GaussNewton:
+    """As configured for the association, but never stopped before it converges: the basin is what is asked for."""
+    return GaussNewton(**{"search_distance_m": 0.4 if association == "vh" else 0.5, "max_iterations": 60, **settings})
+
+
+def register(gauss_newton: GaussNewton, scene: maps.Scene, perturbation: Tensor) -> RegistrationResult:
+    normals = scene.normals if gauss_newton.residual.needs_normals else None
+    T_start = scene.T_world_lidar @ se3.exp(perturbation)
+    return gauss_newton.register(scene.queries, scene.association, T_start, WIDE_M, normals)
+
+
+def assert_all_found(result: RegistrationResult, scene: maps.Scene, grid: Tensor) -> None:
+    distances, angles = maps.errors(result.T_world_lidar, scene.T_world_lidar)
+    missed = (distances > 0.03) | (angles > 0.15)
+    assert not missed.any(), f"from {grid[missed].tolist()}: {distances[missed].tolist()} m, {angles[missed].tolist()} deg"
+    assert result.converged.all()
+
+
+@all_scenes
+@all_associations
+def test_the_basin_with_the_default_kernels(name, association):
+    kernel = Proximity() if association == "p" else GemanMcClure()
+    scene, grid = maps.scene(name, association), maps.planar_grid()[::3]
+    assert_all_found(register(solver(association, weight=kernel), scene, grid), scene, grid)
+
+
+@pytest.mark.slow
+@all_scenes
+@all_associations
+@all_kernels
+def test_the_whole_basin_in_the_plane(name, association, kernel):
+    scene, grid = maps.scene(name, association), maps.planar_grid()
+    assert_all_found(register(solver(association, weight=kernel), scene, grid), scene, grid)
+
+
+@pytest.mark.slow
+@all_scenes
+@pytest.mark.parametrize("association", ["kd", "vh"])
+@all_kernels
+def test_the_whole_basin_along_the_vertical(name, association, kernel):
+    """Not of the projective association, whose candidates share an elevation: a vertical offset takes them away."""
+    scene, grid = maps.scene(name, association), maps.vertical_grid()
+    assert_all_found(register(solver(association, weight=kernel), scene, grid), scene, grid)
+
+
+@all_associations
+def test_generalized_icp_converges(association):
+    scene, grid = maps.scene("street", association), 0.6 * maps.planar_grid()[::5]
+    gauss_newton = solver(association, residual=GeneralizedIcp(), weight=Proximity())
+    assert_all_found(register(gauss_newton, scene, grid), scene, grid)
+
+
+@pytest.mark.parametrize("association", ["kd", "vh"])
+@all_scenes
+def test_point_to_point_converges(name, association):
+    """Slower and less exact than the others, as the points of two scans never coincide."""
+    scene, grid = maps.scene(name, association), 0.3 * maps.planar_grid()[::5]
+    gauss_newton = solver(association, residual=PointToPoint(), weight=Proximity(), max_iterations=120)
+    result = register(gauss_newton, scene, grid)
+    distances, angles = maps.errors(result.T_world_lidar, scene.T_world_lidar)
+    assert distances.max() < 0.06 and angles.max() < 0.3
+
+
+@all_associations
+def test_a_batch_is_its_members_one_by_one(association):
+    scene, grid = maps.scene("room", association), 0.3 * maps.planar_grid()[1:5]
+    gauss_newton = solver(association, translation_tolerance_m=1e-5, rotation_tolerance_deg=1e-4)
+    batch = register(gauss_newton, scene, grid.view(2, 2, 6))
+    assert batch.T_world_lidar.shape == (2, 2, 4, 4) and batch.converged.shape == (2, 2)
+    assert batch.hessian.shape == (2, 2, 6, 6) and batch.weakest_direction.shape == (2, 2, 3)
+    for i, perturbation in enumerate(grid):
+        single = register(gauss_newton, scene, perturbation)
+        T = batch.T_world_lidar.view(4, 4, 4)[i]
+        distance, angle = maps.errors(T, single.T_world_lidar)
+        assert distance < 2e-4 and angle < 2e-3
+        for name in ("overlap", "inlier_share", "fit"):
+            assert getattr(batch, name).view(4)[i].item() == pytest.approx(getattr(single, name).item(), abs=0.01)
+
+
+@all_associations
+def test_a_map_far_away_leaves_the_initial_pose(association):
+    scene = maps.scene("room", association)
+    T_start = scene.T_world_lidar @ se3.exp(torch.tensor([0, 0, 400.0, 0, 0, 0], dtype=torch.float64))
+    result = solver(association).register(scene.queries, scene.association, T_start, WIDE_M)
+    assert_knows_nothing(result, T_start)
+
+
+@all_associations
+def test_an_empty_map_leaves_the_initial_pose(association):
+    _, empty = maps.make(association)
+    T_start = se3.exp(torch.tensor([1.0, 2, 3, 0.1, 0.2, 0.3], dtype=torch.float64))
+    result = solver(association).register(maps.scene("room", association).queries, empty, T_start, WIDE_M)
+    assert_knows_nothing(result, T_start)
+
+
+@all_associations
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_no_points_leave_the_initial_pose(association, batch):
+    scene = maps.scene("room", association)
+    T_start = se3.identity(*batch)
+    result = solver(association).register(torch.zeros(0, 3), scene.association, T_start, WIDE_M)
+    assert_knows_nothing(result, T_start)
+
+
+def assert_knows_nothing(result: RegistrationResult, T_start: Tensor) -> None:
+    torch.testing.assert_close(result.T_world_lidar, T_start, rtol=0, atol=1e-9)
+    assert not result.converged.any() and not result.overlap.any() and not result.fit.any()
+    for value in (result.rmse_m, result.hessian, result.information, result.inlier_share, result.weakest_direction):
+        assert torch.isfinite(value).all()
+    assert not result.information.any()
+
+
+@all_associations
+@pytest.mark.parametrize("name", ["corridor", "tunnel"])
+@pytest.mark.parametrize("offset", [-0.8, 0.5])
+def test_a_direction_that_the_map_does_not_show_is_held(association, name, offset):
+    """Along an endless corridor the scan stays where it was put; across it, it is registered."""
+    scene = maps.scene(name, association)
+    perturbation = torch.tensor([offset, 0.2, 0.1, 0.0, 0.0, 0.03], dtype=torch.float64)
+    result = register(solver(association, min_information=0.01), scene, perturbation)
+    error = se3.inverse(scene.T_world_lidar) @ result.T_world_lidar
+    assert error[0, 3].item() == pytest.approx(offset, abs=0.06)
+    assert error[1:3, 3].norm() < 0.03 and se3.rotation_angle(error).rad2deg() < 0.15
+    assert result.information[0] < 0.01 < result.information[1]
+    assert result.weakest_direction[0].abs() > 0.999
+
+
+@all_associations
+@all_scenes
+def test_scenes_that_show_every_direction_are_not_degenerate(association, name):
+    scene = maps.scene(name, association)
+    result = register(solver(association), scene, torch.zeros(6, dtype=torch.float64))
+    assert result.information.min() > 0.03
+    assert (result.information.diff() >= 0).all()
+
+
+@pytest.mark.parametrize("residual", [PointToPlane(), PointToPoint(), GeneralizedIcp()], ids=lambda r: type(r).__name__)
+def test_the_result_describes_the_registration(residual):
+    scene = maps.scene("room", "kd")
+    result = register(solver("kd", residual=residual), scene, torch.zeros(6, dtype=torch.float64))
+    assert result.converged and 0 < result.iterations < 60
+    assert 0.8 < result.overlap <= 1 and 0 < result.fit <= result.overlap
+    assert (0.6 if isinstance(residual, PointToPoint) else 0.9) < result.inlier_share <= 1
+    assert 0.005 < result.rmse_m < 0.25
+    torch.testing.assert_close(result.hessian, result.hessian.mT, rtol=1e-4, atol=1e-2)
+    assert torch.linalg.eigvalsh(result.hessian).min() > 0
+
+
+class _Plane(Association):
+    """The endless plane z = 0: a neighbour for every point, straight below it."""
+
+    def insert(self, points, T_world_lidar, frames) -> None:
+        raise AssertionError("nothing to insert")
+
+    def clear(self) -> None:
+        raise AssertionError("nothing to clear")
+
+    @property
+    def is_empty(self) -> bool:
+        return False
+
+    def search(self, points_world: Tensor, max_distance_m: float) -> Correspondences:
+        feet = points_world * torch.tensor([1.0, 1.0, 0.0])
+        up = torch.tensor([0.0, 0.0, 1.0]).expand_as(feet)
+        return Correspondences(feet, up, points_world[:, 2].abs() <= max_distance_m)
+
+
+def test_the_optimum_of_a_plane_is_found_in_closed_form():
+    """Height, roll and pitch follow the plane; x, y and yaw are nobody's business and stay."""
+    points = 5 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
+    start = torch.tensor([4.0, -3.0, 0.3, 0.05, -0.04, 0.7], dtype=torch.float64)
+    result = GaussNewton(weight=NoWeight()).register(points, _Plane(), se3.from_euler(start), 3.0)
+    end = se3.to_euler(result.T_world_lidar)
+    assert result.converged and result.rmse_m < 1e-4
+    assert end[2:5].abs().max() < 1e-4
+    assert (end[:2] - start[:2]).abs().max() < 0.05 and (end[5] - start[5]).abs() < 0.01
+    assert result.information[:2].max() < 1e-6 < 0.9 < result.information[2]
+
+
+def test_steps_are_limited():
+    points = 5 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
+    start = torch.tensor([0.0, 0, 2.5, 0, 0, 0], dtype=torch.float64)
+    one_step = GaussNewton(weight=NoWeight(), max_iterations=1, max_step_m=0.4)
+    result = one_step.register(points, _Plane(), se3.exp(start), 3.0)
+    assert result.T_world_lidar[2, 3].item() == pytest.approx(2.1, abs=1e-6)
+    assert result.iterations == 1 and not result.converged
+
+
+@all_associations
+def test_outliers_do_not_pull(association):
+    """A fifth of the scan belongs to something that moved by 0.4 m."""
+    scene = maps.scene("room", association)
+    queries = scene.queries.clone()
+    queries[::5] += torch.tensor([0.4, 0.4, 0.0])
+    gauss_newton = solver(association, weight=GemanMcClure())
+    start = scene.T_world_lidar @ se3.exp(torch.tensor([0.1, -0.1, 0, 0, 0, 0.02], dtype=torch.float64))
+    result = gauss_newton.register(queries, scene.association, start, 1.0)
+    distance, angle = maps.errors(result.T_world_lidar, scene.T_world_lidar)
+    assert distance < 0.02 and angle < 0.15

@@ -1,0 +1,116 @@
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.geometry.normals import normal_map
+from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.registration.association import Projective
+from tests.registration import maps
+
+SMALL = SphericalProjection(height=16, width=90, fov_up_deg=3.0, fov_down_deg=-24.0)
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[Tensor]:
+    return [maps.drive("street").scan(i).points for i in range(4)]
+
+
+def poses() -> Tensor:
+    return maps.drive("street").T_world_lidar
+
+
+def slow_search(frames: list[tuple[Tensor, Tensor]], T_world_last: Tensor, query: Tensor) -> Tensor | None:
+    """The paper's words: every frame projected into the last scan's image; of the query's pixel, the closest in 3D.
+
+    `frames` holds the points with normals of each scan, and its pose.
+    """
+    T_lidar_world = se3.inverse(T_world_last)
+    pixel = SMALL.pixel_index(se3.transform(T_lidar_world, query[None]))[0]
+    best, smallest = None, math.inf
+    for points, T_world in frames:
+        local = se3.transform(T_lidar_world @ T_world, points)
+        same = SMALL.pixel_index(local) == pixel
+        if pixel < 0 or not same.any():
+            continue
+        nearest = se3.transform(T_world, points)[same][local[same].norm(dim=1).argmin()]
+        if (nearest - query).norm() < smallest:
+            best, smallest = nearest, (nearest - query).norm().item()
+    return best
+
+
+def test_agrees_with_the_words_of_the_paper(scans):
+    association, frames = Projective(SMALL), []
+    for i in range(3):
+        association.insert(scans[i], poses()[i], frames=30)
+        vertices = SMALL.vertex_map(scans[i])
+        frames.append((vertices[:, (normal_map(vertices) != 0).any(dim=0)].T, poses()[i]))
+    queries = se3.transform(poses()[3], scans[3][::97])
+    found = association.search(queries, 2.0)
+    agreeing = 0
+    for i, query in enumerate(queries):
+        expected = slow_search(frames, poses()[2], query)
+        if expected is None or (expected - query).norm() > 2.0:
+            agreeing += not found.mask[i]
+        else:
+            agreeing += bool(found.mask[i]) and torch.allclose(found.points[i], expected, atol=1e-4)
+    assert found.mask.sum() > 100
+    assert agreeing >= len(queries) - 2  # a point on the border of a pixel may round to either side
+
+
+def test_a_scan_finds_itself(scans):
+    association = Projective(SphericalProjection())
+    association.insert(scans[0], poses()[0], frames=30)
+    vertices = association.projection.vertex_map(scans[0])
+    own = vertices[:, (normal_map(vertices) != 0).any(dim=0)].T
+    found = association.search(se3.transform(poses()[0], own), 0.5)
+    assert found.mask.float().mean() > 0.999
+    torch.testing.assert_close(found.points[found.mask], own[found.mask], rtol=0, atol=1e-4)
+    assert (found.normals[found.mask].norm(dim=1) - 1).abs().max() < 1e-4
+
+
+def test_the_window_forgets_the_oldest_scans(scans):
+    window, alone = Projective(SMALL), Projective(SMALL)
+    for i in range(4):
+        window.insert(scans[i], poses()[i], frames=2)
+    for i in (2, 3):
+        alone.insert(scans[i], poses()[i], frames=2)
+    queries = se3.transform(poses()[3], scans[3][::31])
+    a, b = window.search(queries, 1.0), alone.search(queries, 1.0)
+    assert torch.equal(a.mask, b.mask) and torch.equal(a.points[a.mask], b.points[b.mask])
+
+
+def test_more_scans_find_closer_points(scans):
+    few, many = Projective(SMALL), Projective(SMALL)
+    for i in range(3):
+        many.insert(scans[i], poses()[i], frames=30)
+        few.insert(scans[i], poses()[i], frames=1)
+    queries = se3.transform(poses()[3], scans[3][::31])
+    a, b = few.search(queries, 1.0), many.search(queries, 1.0)
+    assert b.mask.sum() > a.mask.sum()
+    both = a.mask & b.mask
+    closer = (b.points - queries)[both].norm(dim=1) <= (a.points - queries)[both].norm(dim=1) + 1e-5
+    assert closer.all()
+
+
+def test_out_of_view_is_not_associated(scans):
+    association = Projective(SMALL)
+    association.insert(scans[0], poses()[0], frames=30)
+    overhead = torch.tensor([[0.0, 0.0, 5.0], [2.0, 0.0, 9.0], [0.0, 0.0, 0.0]])
+    assert not association.search(overhead, 100.0).mask.any()
+
+
+def test_normals_turn_with_the_scan(scans):
+    T = se3.exp(torch.tensor([5.0, 1, 0, 0.2, -0.1, 1.0], dtype=torch.float64))
+    straight, turned = Projective(SMALL), Projective(SMALL)
+    straight.insert(scans[0], se3.identity(), frames=1)
+    turned.insert(scans[0], T, frames=1)
+    queries = scans[0][::53]
+    a, b = straight.search(queries, 0.5), turned.search(se3.transform(T, queries), 0.5)
+    both = a.mask & b.mask
+    assert both.float().mean() > 0.3
+    expected = a.normals @ T[:3, :3].float().T
+    agreeing = ((expected - b.normals).norm(dim=1) < 1e-3)[both]
+    assert agreeing.float().mean() > 0.99

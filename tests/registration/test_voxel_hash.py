@@ -1,0 +1,75 @@
+import pytest
+import torch
+
+from lidarlearn.geometry import se3
+from lidarlearn.registration.association import KdTree, VoxelHash
+from tests.registration import maps
+
+VOXEL = 0.4
+
+
+@pytest.fixture(scope="module", params=["room", "street"])
+def both(request) -> tuple[KdTree, VoxelHash, torch.Tensor]:
+    """The same map in both structures, and queries somewhere near it."""
+    scene, other = maps.scene(request.param, "kd"), maps.scene(request.param, "vh")
+    generator = torch.Generator().manual_seed(0)
+    queries = se3.transform(scene.T_world_lidar, scene.queries)
+    queries = queries + 0.2 * torch.randn(queries.shape, generator=generator)
+    return scene.association, other.association, queries
+
+
+def recall(exact, found) -> float:
+    """Share of the exact neighbours that were found."""
+    return (exact.points == found.points).all(dim=1)[exact.mask & found.mask].sum().item() / exact.mask.sum().item()
+
+
+def test_recall_is_full_within_one_voxel_edge(both, record_property):
+    tree, table, queries = both
+    exact, found = tree.search(queries, VOXEL), table.search(queries, VOXEL)
+    assert exact.mask.sum() > 200
+    record_property("recall", recall(exact, found))
+    assert recall(exact, found) >= 0.99
+    assert not (found.mask & ~exact.mask).any()
+
+
+@pytest.mark.parametrize("distance", [0.8, 1.6])
+def test_wider_searches_visit_more_rings(both, distance):
+    tree, table, queries = both
+    generator = torch.Generator().manual_seed(1)
+    queries = queries + distance / 3 * torch.randn(queries.shape, generator=generator)
+    assert recall(tree.search(queries, distance), table.search(queries, distance)) >= 0.99
+
+
+def test_the_widest_search_finds_a_neighbour_wherever_four_rings_reach(both):
+    tree, table, queries = both
+    shifted = queries + torch.tensor([0.0, 0.0, 1.0])
+    exact, found = tree.search(shifted, 3.0), table.search(shifted, 3.0)
+    near = exact.mask & ((exact.points - shifted).norm(dim=1) < 4 * VOXEL)
+    assert near.sum() > 200 and found.mask[near].all()
+
+
+def test_a_search_in_pieces_is_the_search_at_once(both, monkeypatch):
+    _, table, queries = both
+    whole = table.search(queries, 1.6)
+    monkeypatch.setattr("lidarlearn.registration.association.voxel_hash._CANDIDATES_AT_ONCE", 10_000)
+    pieces = table.search(queries, 1.6)
+    assert torch.equal(whole.mask, pieces.mask)
+    assert torch.equal(whole.points[whole.mask], pieces.points[whole.mask])
+
+
+def test_voxels_that_share_a_slot_of_the_table_are_told_apart():
+    """The table wraps around in space: what stands 512 voxels away must not be taken for a neighbour."""
+    table = VoxelHash(VOXEL)
+    points = torch.tensor([[0.2, 0.2, 0.2], [30.2, 0.2, 0.2]])
+    table.insert(points, se3.identity(), frames=30)
+    for period in ([512, 0, 0], [0, 512, 0], [0, 0, 64], [-512, 512, 64]):
+        away = points + VOXEL * torch.tensor(period)
+        assert not table.search(away, VOXEL).mask.any()
+    assert table.search(points, VOXEL).mask.all()
+
+
+def test_normals_are_those_of_the_tree(both):
+    tree, table, queries = both
+    exact, found = tree.search(queries, VOXEL), table.search(queries, VOXEL)
+    same = exact.mask & found.mask & (exact.points == found.points).all(dim=1)
+    torch.testing.assert_close(exact.normals[same], found.normals[same])

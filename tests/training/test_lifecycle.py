@@ -1,0 +1,175 @@
+"""A training from its first step to the checkpoint alone, on a tiny world."""
+
+import pytest
+import torch
+
+from lidarlearn.commands.train import train
+from lidarlearn.data.cache import decode, encode
+from lidarlearn.errors import UserError
+from lidarlearn.geometry import se3
+from lidarlearn.metrics.relative import relative_errors
+from lidarlearn.training.checkpoints import load_checkpoint
+from lidarlearn.training.module import PoseNetModule
+from lidarlearn.training.supervised import SupervisedModule
+from lidarlearn.training.unsupervised import UnsupervisedModule
+from tests.box_world import SMALL, BoxDrives
+from tests.training.runs import configured, curves, image_tags
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
+EPOCHS, FRAMES = 4, 41  # two drives of 40 pairs: ten batches of eight an epoch
+
+
+@pytest.fixture(scope="module", params=["weighted_icp", "icp", "supervised"])
+def run(request, tmp_path_factory):
+    """A finished training with each of the losses."""
+    folder = tmp_path_factory.mktemp(request.param) / "run"
+    config = configured(folder, f"loss={request.param}", f"trainer.max_epochs={EPOCHS}", frames=FRAMES)
+    best = train(config, data_name="boxes")
+    return folder, best, request.param
+
+
+def test_the_run_folder_is_whole(run):
+    folder, best, _ = run
+    assert best == folder / "checkpoints" / "best.ckpt"
+    assert sorted(p.name for p in (folder / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
+    assert (folder / "config.yaml").read_text().count("PoseNet") >= 1
+    assert (folder / "git_revision.txt").read_text().strip()
+    assert list(folder.glob("events.out.tfevents*"))
+
+
+def test_the_loss_falls(run):
+    folder, _, _ = run
+    losses = [value for _, value in curves(folder)["train/loss_epoch"]]
+    assert len(losses) == EPOCHS
+    assert min(losses[1:]) < losses[0] - 0.2 * abs(losses[0])
+
+
+def test_the_curves_that_were_promised(run):
+    folder, _, loss = run
+    tags = curves(folder).keys()
+    parts = {"s1", "s2"} if loss == "supervised" else {"activated_share", "residual_m"}
+    assert {f"train/{part}_epoch" for part in parts} <= tags
+    assert {"train/loss_step", "lr-Adam", "val/loss", "val/error", "val/mean_relative_translation_error_m"} <= tags
+
+
+def test_the_images_that_were_promised(run):
+    tags = " ".join(image_tags(run[0]))
+    assert all(word in tags for word in ("vertex map", "normal map", "trajectory 2"))
+
+
+def test_a_checkpoint_is_plain_data_that_says_what_it_was_trained_on(run):
+    folder, best, loss = run
+    trained_on = torch.load(best, weights_only=True)["hyper_parameters"]["trained_on"]
+    assert trained_on["data_name"] == "boxes"
+    assert trained_on["data"]["_target_"] == "tests.box_world.BoxDrives"
+    assert loss.split("_")[0] in trained_on["loss"].lower()
+    assert trained_on["projection"] == {"height": 16, "width": 96, "fov_up_deg": 15.0, "fov_down_deg": -20.0}
+    assert {"git", "lidarlearn"} <= trained_on.keys()
+
+
+def test_a_checkpoint_alone_gives_the_error_that_was_logged(run):
+    folder, _, loss = run
+    module = PoseNetModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
+    assert isinstance(module, SupervisedModule if loss == "supervised" else UnsupervisedModule)
+    sequence = BoxDrives(frames=FRAMES).sequence("2")
+    maps = torch.stack([decode(encode(module.projection.vertex_map(scan.points))) for scan in sequence])
+    T = se3.accumulate(module.relative_pose(maps[:-1], maps[1:]))
+    error = relative_errors(T, sequence.T_world_lidar).translation.mean()
+    logged = curves(folder)["val/mean_relative_translation_error_m"][-1][1]
+    assert float(error) == pytest.approx(logged, rel=1e-3)
+
+
+def test_best_is_the_epoch_with_the_smallest_validation_error(run):
+    folder, best, _ = run
+    errors = [value for _, value in curves(folder)["val/error"]]
+    assert load_checkpoint(best)["epoch"] == min(range(EPOCHS), key=errors.__getitem__)
+    assert load_checkpoint(best.with_name("last.ckpt"))["epoch"] == EPOCHS - 1
+
+
+def test_resuming_goes_on_at_the_right_epoch(run, tmp_path):
+    folder, best, loss = run
+    config = configured(
+        tmp_path / "resumed",
+        f"loss={loss}",
+        f"trainer.max_epochs={EPOCHS + 1}",
+        f"ckpt={folder}/checkpoints/last.ckpt",
+        frames=FRAMES,
+    )
+    train(config, data_name="boxes")
+    after = load_checkpoint(tmp_path / "resumed" / "checkpoints" / "last.ckpt")
+    assert after["epoch"] == EPOCHS
+    assert after["global_step"] == (EPOCHS + 1) * 10
+    steps = [step for step, _ in curves(tmp_path / "resumed")["train/loss_step"]]
+    assert steps == list(range(EPOCHS * 10, (EPOCHS + 1) * 10))
+
+
+def test_resuming_where_nothing_is_left_says_so(run, tmp_path):
+    folder, _, loss = run
+    checkpoint = folder / "checkpoints" / "last.ckpt"
+    config = configured(tmp_path / "r", f"loss={loss}", f"trainer.max_epochs={EPOCHS}", f"ckpt={checkpoint}", frames=5)
+    with pytest.raises(UserError, match=r"already seen 4 epochs(.|\n)*trainer\.max_epochs"):
+        train(config, data_name="boxes")
+
+
+def test_resuming_with_another_model_says_so(run, tmp_path):
+    folder, best, loss = run
+    config = configured(tmp_path / "r", f"loss={loss}", "model.backbone=resnet34", f"ckpt={best}", frames=5)
+    with pytest.raises(UserError, match="trained with model"):
+        train(config, data_name="boxes")
+
+
+def test_two_runs_from_one_seed_are_the_same(tmp_path):
+    losses = []
+    for name in ("a", "b"):
+        config = configured(tmp_path / name, "trainer.max_epochs=1", "seed=7", frames=17)
+        train(config, data_name="boxes")
+        losses.append(curves(tmp_path / name)["train/loss_step"])
+    assert losses[0] == losses[1]
+
+
+def test_without_ground_truth_the_loss_chooses_the_best(tmp_path):
+    config = configured(tmp_path / "run", "trainer.max_epochs=1", frames=9, without_truth=["0", "2"])
+    best = train(config, data_name="boxes")
+    scalars = curves(tmp_path / "run")
+    assert best.name == "best.ckpt"
+    assert scalars["val/error"] == scalars["val/loss"]
+    assert "val/mean_relative_translation_error_m" not in scalars
+
+
+def test_supervised_training_without_ground_truth_says_so(tmp_path):
+    config = configured(tmp_path / "run", "loss=supervised", frames=9, without_truth=["0"])
+    with pytest.raises(UserError, match=r"needs ground truth(.|\n)*train_sequences"):
+        train(config, data_name="boxes")
+
+
+def test_without_validation_the_last_checkpoint_is_what_there_is(tmp_path):
+    config = configured(tmp_path / "run", "trainer.max_epochs=1", frames=9, val_sequences=[])
+    assert train(config, data_name="boxes").name == "last.ckpt"
+
+
+def test_a_part_of_the_validation_is_scored_as_far_as_it_goes(tmp_path):
+    config = configured(
+        tmp_path / "run", "trainer.max_epochs=1", "+trainer.limit_train_batches=1", "trainer.limit_val_batches=2",
+        frames=33,
+    )  # fmt: skip
+    train(config, data_name="boxes")
+    assert curves(tmp_path / "run")["val/error"][0][1] > 0
+
+
+def test_an_image_that_scans_do_not_fill_is_told(tmp_path):
+    config = configured(
+        tmp_path / "run", "trainer.max_epochs=1", "datamodule.height=64", "datamodule.width=720", frames=9
+    )
+    with pytest.warns(UserWarning, match=r"% of the 64x720 pixels(.|\n)*datamodule\.height"):
+        train(config, data_name="boxes")
+
+
+def test_bf16(tmp_path):
+    config = configured(tmp_path / "run", "trainer.max_epochs=1", "trainer.precision=bf16-mixed", frames=9)
+    train(config, data_name="boxes")
+    assert curves(tmp_path / "run")["train/loss_epoch"][0][1] < 1
+
+
+def test_a_loaded_network_knows_its_image_and_is_ready_to_predict(run):
+    module = PoseNetModule.load_from_checkpoint(run[1])
+    assert module.projection == SMALL and not module.training
