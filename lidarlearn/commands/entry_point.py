@@ -67,7 +67,7 @@ def readable_message(error: Exception) -> str | None:
         key = next((line for line in str(error).splitlines() if line.startswith("full_key:")), "")
         return "  ".join(part for part in (str(cause), key.replace("full_key:", "in the config node")) if part)
     if isinstance(error, HydraException | OmegaConfBaseException):
-        lines = [line.strip() for line in str(error).splitlines()]
+        lines = [line.strip() for line in str(error).partition("\nConfig search path:")[0].splitlines()]
         return "  ".join(line for line in lines if line and not line.startswith(("See https", "object_type=", "^")))
     return None
 

@@ -55,7 +55,8 @@ class ProgressLines(ProgressBar):
         loss = float(outputs["loss"] if isinstance(outputs, dict) else outputs)
         self._loss = loss if batch_idx == 0 else 0.95 * self._loss + 0.05 * loss
         terminal = sys.stdout.isatty()
-        if time.monotonic() - self._last_shown >= (0.1 if terminal else self.seconds_between_lines):
+        ends = batch_idx + 1 >= trainer.num_training_batches and not terminal  # the epoch's own line follows
+        if not ends and time.monotonic() - self._last_shown >= (0.1 if terminal else self.seconds_between_lines):
             self._last_shown = time.monotonic()
             share = (batch_idx + 1) / max(1, trainer.num_training_batches)
             self._show(f"{self._head(trainer, share)}  loss {self._loss:.4g}  {self._left(trainer, share)}", terminal)

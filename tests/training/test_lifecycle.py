@@ -16,7 +16,7 @@ from tests.box_world import SMALL, BoxDrives
 from tests.training.runs import configured, curves, image_tags
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
-EPOCHS, FRAMES = 4, 41  # two drives of 40 pairs: ten batches of eight an epoch
+EPOCHS, FRAMES = 3, 33  # two drives of 32 pairs: eight batches of eight an epoch
 
 
 @pytest.fixture(scope="module", params=["weighted_icp", "icp", "supervised"])
@@ -38,10 +38,12 @@ def test_the_run_folder_is_whole(run):
 
 
 def test_the_loss_falls(run):
-    folder, _, _ = run
-    losses = [value for _, value in curves(folder)["train/loss_epoch"]]
+    folder, _, loss = run
+    # The supervised loss has no lower bound to fall towards: its squared error has.
+    what = "translation_squared_m2" if loss == "supervised" else "loss"
+    losses = [value for _, value in curves(folder)[f"train/{what}_epoch"]]
     assert len(losses) == EPOCHS
-    assert min(losses[1:]) < losses[0] - 0.2 * abs(losses[0])
+    assert min(losses[1:]) < 0.8 * losses[0]
 
 
 def test_the_curves_that_were_promised(run):
@@ -98,16 +100,16 @@ def test_resuming_goes_on_at_the_right_epoch(run, tmp_path):
     train(config, data_name="boxes")
     after = load_checkpoint(tmp_path / "resumed" / "checkpoints" / "last.ckpt")
     assert after["epoch"] == EPOCHS
-    assert after["global_step"] == (EPOCHS + 1) * 10
+    assert after["global_step"] == (EPOCHS + 1) * 8
     steps = [step for step, _ in curves(tmp_path / "resumed")["train/loss_step"]]
-    assert steps == list(range(EPOCHS * 10, (EPOCHS + 1) * 10))
+    assert steps == list(range(EPOCHS * 8, (EPOCHS + 1) * 8))
 
 
 def test_resuming_where_nothing_is_left_says_so(run, tmp_path):
     folder, _, loss = run
     checkpoint = folder / "checkpoints" / "last.ckpt"
     config = configured(tmp_path / "r", f"loss={loss}", f"trainer.max_epochs={EPOCHS}", f"ckpt={checkpoint}", frames=5)
-    with pytest.raises(UserError, match=r"already seen 4 epochs(.|\n)*trainer\.max_epochs"):
+    with pytest.raises(UserError, match=r"already seen 3 epochs(.|\n)*trainer\.max_epochs"):
         train(config, data_name="boxes")
 
 

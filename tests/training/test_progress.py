@@ -1,0 +1,60 @@
+"""The progress bar, on a terminal and in a log file."""
+
+import re
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from lidarlearn.training.progress import ProgressLines
+
+
+@pytest.fixture
+def trainer():
+    metrics = {
+        "train/loss_epoch": torch.tensor(0.125),
+        "val/avg_translation_error_percent": torch.tensor(3.456),
+        "val/mean_relative_translation_error_m": torch.tensor(0.0789),
+    }
+    return SimpleNamespace(current_epoch=0, max_epochs=2, num_training_batches=4, callback_metrics=metrics)
+
+
+def run(bar, trainer):
+    bar.on_train_start(trainer, None)
+    for epoch in range(2):
+        trainer.current_epoch = epoch
+        bar.on_train_epoch_start(trainer, None)
+        for i in range(4):
+            bar.on_train_batch_end(trainer, None, {"loss": torch.tensor(0.5)}, None, i)
+        bar.on_train_epoch_end(trainer, None)
+
+
+def test_in_a_log_file_one_line_an_epoch(trainer, capsys):
+    run(ProgressLines(seconds_between_lines=1000), trainer)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2
+    assert re.match(r"epoch 1/2 \[#{20}\] 100 %  loss 0\.125", lines[0])
+    assert "3.46 %" in lines[0] and "0.079 m" in lines[0]
+    assert lines[1].startswith("epoch 2/2") and "left" not in lines[1]
+
+
+def test_a_long_epoch_writes_lines_within(trainer, capsys):
+    run(ProgressLines(seconds_between_lines=0), trainer)
+    lines = capsys.readouterr().out.splitlines()
+    shares = [int(re.search(r"(\d+) %", line)[1]) for line in lines]
+    assert shares == [25, 50, 75, 100, 25, 50, 75, 100]
+    assert all("loss 0.5" in line for line in lines[:3])
+
+
+def test_on_a_terminal_the_bar_moves_in_place(trainer, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    run(ProgressLines(), trainer)
+    out = capsys.readouterr().out
+    assert out.count("\n") == 2 and out.count("\r") >= 2
+
+
+def test_the_other_processes_of_a_run_are_silent(trainer, capsys):
+    bar = ProgressLines(0)
+    bar.disable()
+    run(bar, trainer)
+    assert capsys.readouterr().out == ""
