@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 
 import hydra
-from hydra.errors import HydraException, InstantiationException
+from hydra.errors import HydraException, InstantiationException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -66,6 +66,9 @@ def readable_message(error: Exception) -> str | None:
             return None
         key = next((line for line in str(error).splitlines() if line.startswith("full_key:")), "")
         return "  ".join(part for part in (str(cause), key.replace("full_key:", "in the config node")) if part)
+    if isinstance(error, OverrideParseException):
+        remedy = "a value with '=', ',' or spaces needs quotes: 'ckpt=\"a=b.ckpt\"'"
+        return f"{error.override}: {error.message.splitlines()[0]}; {remedy}"
     if isinstance(error, HydraException | OmegaConfBaseException):
         lines = [line.strip() for line in str(error).partition("\nConfig search path:")[0].splitlines()]
         return "  ".join(line for line in lines if line and not line.startswith(("See https", "object_type=", "^")))

@@ -1,5 +1,6 @@
 """`python train.py`: train PoseNet on a data set, with or without ground truth."""
 
+import os
 import shlex
 import string
 from pathlib import Path
@@ -8,7 +9,6 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.pytorch import Trainer, seed_everything
-from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 import lidarlearn
@@ -68,7 +68,8 @@ def evaluate_command(checkpoint: Path) -> str:
 
 def _train_and_say_what_next(config: DictConfig) -> None:
     checkpoint = train(config, HydraConfig.get().runtime.choices["data"]).resolve()
-    if rank_zero_only.rank == 0 and checkpoint.exists():
+    first_process = os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
+    if first_process and checkpoint.exists():
         print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
         print(f"next:       {evaluate_command(checkpoint)}")
 
@@ -103,7 +104,9 @@ def _check_resumable(path: Path, module: PoseNetModule, max_epochs: int | None) 
     for part in ("model", "loss"):
         was, now = checkpoint["hyper_parameters"][part], module.hparams[part]
         if was != now:
-            raise UserError(f"ckpt={path} was trained with {part} {was}\n  this run has {now}\n  change: one of the two")
+            raise UserError(
+                f"ckpt={path} was trained with {part} {was}\n  this run has {now}\n  change: one of the two"
+            )
     done = checkpoint["epoch"] + 1
     if max_epochs is not None and 0 <= max_epochs <= done:
         raise UserError(f"ckpt={path} has already seen {done} epochs\n  change: trainer.max_epochs to more than that")

@@ -78,7 +78,7 @@ class OdometryDataModule(LightningDataModule):
                 f"{self.data.title}: no pair of scans to train on in sequences {list(self.data.train_sequences)}"
                 "\n  change: data.train_sequences, or data.max_frames"
             )
-        self._train_pairs = ConcatDataset(pairs)
+        self._train_pairs: ConcatDataset[Pair] = ConcatDataset(pairs)
         self.val_sequences = [self.data.sequence(name) for name in self.data.val_sequences]
         self._val_pairs = [self._pairs(s, s.T_world_lidar is not None, mirror=False) for s in self.val_sequences]
 

@@ -172,5 +172,5 @@ def _write(export: Export, sequence: Sequence, poses: list[Tensor], records: lis
     export.summary.write_text(json.dumps(summary, indent=2) + "\n")
 
 
-def _mean(values: list[float]) -> float | None:
+def _mean(values: list[int] | list[float]) -> float | None:
     return statistics.fmean(values) if values else None

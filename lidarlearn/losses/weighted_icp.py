@@ -37,6 +37,6 @@ class WeightedIcpLoss(ProjectiveLoss):
     def rho(
         self, residuals: Float[Tensor, "*batch"], squared_distances: Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch"]:
-        """w r^2 of each correspondence [m^2]."""
+        """W r^2 of each correspondence [m^2]."""
         weights = (-squared_distances.detach() / self.sigma_m**2).exp()
         return weights * residuals * residuals

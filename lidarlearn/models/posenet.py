@@ -96,9 +96,7 @@ class ColumnWrappedConv2d(nn.Conv2d):
         """Convolve after padding the columns circularly."""
         rows, columns = int(self.padding[0]), int(self.padding[1])
         wrapped = pad(input, (columns, columns, 0, 0), mode="circular")
-        return nn.functional.conv2d(
-            wrapped, self.weight, self.bias, self.stride, (rows, 0), self.dilation, self.groups
-        )
+        return nn.functional.conv2d(wrapped, self.weight, self.bias, self.stride, (rows, 0), self.dilation, self.groups)
 
 
 def _wrap_columns(network: nn.Module) -> None:

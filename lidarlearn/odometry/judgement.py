@@ -18,6 +18,8 @@ class Judgement:
         min_points: fewest points that can be registered.
         min_overlap: smallest acceptable share of points that have a neighbour in the map.
         min_inlier_share: smallest acceptable share of those that fit it.
+        min_fit_share: smallest expected `RegistrationResult.fit` as a share of the best of the last scans: below it,
+            other motions are tried, as after a turn that is too wide to be pulled in and finds a false fit near by.
         min_information: the weakest direction counts as degenerate below it, see `RegistrationResult.information`.
         max_deviation_m: largest plausible change of motion from one scan to the next [m]; 0.5 m at 10 Hz is an
             acceleration of 50 m/s^2.
@@ -26,8 +28,9 @@ class Judgement:
     """
 
     min_points: int = 100
-    min_overlap: float = 0.1
+    min_overlap: float = 0.03
     min_inlier_share: float = 0.6
+    min_fit_share: float = 0.7
     min_information: float = 0.005
     max_deviation_m: float = 0.5
     max_deviation_deg: float = 8.0

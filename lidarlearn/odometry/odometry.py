@@ -55,6 +55,7 @@ class Odometry(ScanByScan):
         self._doubted_motion: Tensor | None = None
         self._first: PreparedScan | None = None  # until the motion within it is known
         self._surprises_m: deque[float] = deque(maxlen=5)
+        self._fits: deque[float] = deque(maxlen=5)
         self._frames = 0
         self._coasting = 0
 
@@ -109,7 +110,7 @@ class Odometry(ScanByScan):
             return self._coast(Health(self._frames, initialization=source, points=len(scan.points), overlap=0.0))
         result = self._register(scan, T_previous_new)
         health = self._assess(scan, result, source)
-        if self._recovery and source != "start" and (health.implausible or not self._judgement.accepts(result)):
+        if self._recovery and source != "start" and self._is_doubtful(result, health):
             hypotheses = surprise_motions(T_previous_new, self._motion)
             second = self._register(scan, self._search(scan, hypotheses))
             if second.fit > result.fit:
@@ -117,11 +118,16 @@ class Odometry(ScanByScan):
             health = replace(health, status="recovered")
         if not self._judgement.accepts(result):
             return self._coast(health)
+        self._fits.append(result.fit.item())
         self._surprises_m.append(self._displacement_m(scan, T_previous_new, result.T_world_lidar))
         self._trust(self._motion_to(result.T_world_lidar), health)
         self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
         self._coasting = 0
         return health
+
+    def _is_doubtful(self, result: RegistrationResult, health: Health) -> bool:
+        fits_as_before = result.fit.item() >= self._judgement.min_fit_share * max(self._fits, default=0.0)
+        return health.implausible or not fits_as_before or not self._judgement.accepts(result)
 
     def _register(self, scan: PreparedScan, T_previous_new: Tensor) -> RegistrationResult:
         surprise = max(self._surprises_m, default=math.inf)

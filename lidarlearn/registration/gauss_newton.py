@@ -224,10 +224,11 @@ class _Position:
 def _position(system: _System) -> _Position:
     # A ridge far below any information keeps an empty system solvable, and above the rounding of single precision it
     # holds what nothing is known of, such as the yaw on a bare plane.
-    blocks = system.H.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 3)).mean(-1)  # of translation and of rotation
+    H = torch.nan_to_num(system.H)
+    blocks = H.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 3)).mean(-1)  # of translation and of rotation
     ridge = torch.diag_embed(1e-6 * blocks.repeat_interleave(3, dim=-1) + 1e-9)
     # 6x6 and on the critical path: a GPU's solvers would cost more than the trip.
-    H = torch.nan_to_num(system.H + ridge).cpu()
+    H = (H + ridge).cpu()
     covariance = torch.linalg.inv(H)
     variances, directions = torch.linalg.eigh(covariance[..., :3, :3])
     variances, directions = variances.flip(-1), directions.flip(-1)

@@ -1,5 +1,6 @@
 """What TensorBoard shows besides curves: images of the input and trajectories of held-out drives."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -96,7 +97,7 @@ def normal_image(normals: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
 
 def scalar_image(values: Float[Tensor, "h w"], valid: Tensor, largest: float) -> Float[Tensor, "3 h w"]:
     """Values from 0 to `largest` in colour; black where not valid."""
-    colours = torch.tensor(colormaps["turbo"].resampled(256).colors, dtype=torch.float32)[:, :3]
+    colours = torch.from_numpy(colormaps["turbo"](np.arange(256))[:, :3]).float()
     index = (values / largest * 255).clamp(0, 255).long().cpu()
     return torch.where(valid.cpu(), colours[index].movedim(-1, 0), 0.0)
 

@@ -40,7 +40,8 @@ def load_checkpoint(path: Path, map_location: torch.device | str = "cpu") -> dic
     except pickle.UnpicklingError as error:
         raise CheckpointError(path, "holds objects that only running its code could load, which is refused.") from error
     except (RuntimeError, EOFError, OSError) as error:
-        raise CheckpointError(path, f"is damaged: {str(error).splitlines()[0]}") from error
+        reason = next(iter(str(error).splitlines()), "it ends too early")
+        raise CheckpointError(path, f"is damaged: {reason}") from error
     if not isinstance(checkpoint, dict) or any(key not in checkpoint for key in _NEEDED):
         raise CheckpointError(path, "was not written by lidarlearn's training.")
     return checkpoint

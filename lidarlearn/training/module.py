@@ -124,7 +124,7 @@ class PoseNetModule(LightningModule):
             for sequence, predictions in zip(self.val_sequences, self._predictions, strict=True)
         ]
         means = mean_errors([e for e in map(drive_errors, self.predicted_drives) if e is not None])
-        loss = self.all_gather(torch.stack(self._val_losses).mean()).mean() if self._val_losses else torch.tensor(0.0)
+        loss = self._of_all(torch.stack(self._val_losses)).mean() if self._val_losses else torch.tensor(0.0)
         error = means.get("avg_translation_error_percent", means.get("mean_relative_translation_error_m", float(loss)))
         self.log_dict({f"val/{name}": value for name, value in means.items()}, rank_zero_only=True)
         # every process needs the error, and has the same one: it decides about checkpoints together
@@ -149,6 +149,12 @@ class PoseNetModule(LightningModule):
         """Indices and parameters of a sequence's predictions, of all processes together."""
         if not predictions:
             return torch.zeros(0, dtype=torch.long), torch.zeros(0, 6)
-        indices = self.all_gather(torch.cat([index for index, _ in predictions]))
-        parameters = self.all_gather(torch.cat([values for _, values in predictions]))
+        indices = self._of_all(torch.cat([index for index, _ in predictions]))
+        parameters = self._of_all(torch.cat([values for _, values in predictions]))
         return indices.reshape(-1), parameters.reshape(-1, 6)
+
+    def _of_all(self, values: Tensor) -> Tensor:
+        """The values of all processes, stacked where there are several; the sampler gives each equally many."""
+        gathered = self.all_gather(values)
+        assert isinstance(gathered, Tensor)
+        return gathered

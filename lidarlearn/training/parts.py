@@ -26,7 +26,7 @@ def build(node: Mapping[str, Any], **arguments: Any) -> Any:
 
     Raises:
         UntrustedTargetError: `_target_` is missing or names something else.
-        UserError: the arguments do not fit the constructor.
+        UserError: the constructor does not take, or refuses, the arguments.
     """
     name = node.get("_target_")
     target = _trusted_class(name)
@@ -35,18 +35,21 @@ def build(node: Mapping[str, Any], **arguments: Any) -> Any:
         inspect.signature(target).bind(**merged)
     except TypeError as error:
         raise UserError(f"{name}: {error}\n  change: its keys are {_keys(target)}") from error
-    return target(**merged)
+    try:
+        return target(**merged)
+    except (TypeError, ValueError) as error:  # a value that the constructor refuses
+        raise UserError(f"{name}: {error}\n  it was given {_without(arguments, merged)}") from error
 
 
 def require_trusted(node: object) -> None:
-    """Check, at any depth, that a config out of a checkpoint names nothing but classes that `build` accepts.
+    """Check, at any depth, that a config out of a checkpoint names nothing but classes and functions of these packages.
 
     Raises:
         UntrustedTargetError: a `_target_` names something else.
     """
     if isinstance(node, Mapping):
         if "_target_" in node:
-            _trusted_class(node["_target_"])
+            _trusted(node["_target_"])
         for value in node.values():
             require_trusted(value)
     elif isinstance(node, list | tuple):
@@ -55,17 +58,23 @@ def require_trusted(node: object) -> None:
 
 
 def _trusted_class(name: object) -> type:
+    target = _trusted(name)
+    if not inspect.isclass(target):
+        raise UntrustedTargetError(f"_target_ {name!r} is not built: it is no class of {', '.join(TRUSTED_PACKAGES)}*")
+    return target
+
+
+def _trusted(name: object) -> Any:
+    """The class or function of that name, if one of the trusted packages defines it and not merely imports it."""
     if not isinstance(name, str) or not name.startswith(TRUSTED_PACKAGES):
-        raise UntrustedTargetError(
-            f"_target_ {name!r} is not built: only classes of {', '.join(TRUSTED_PACKAGES)}* are"
-        )
+        raise UntrustedTargetError(f"_target_ {name!r} is not built: only {', '.join(TRUSTED_PACKAGES)}* are")
     module_name, _, attribute = name.rpartition(".")
     try:
         target = getattr(importlib.import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
         raise UserError(f"_target_ {name!r} does not exist: {error}") from error
-    if not inspect.isclass(target) or not f"{target.__module__}.".startswith(TRUSTED_PACKAGES):
-        raise UntrustedTargetError(f"_target_ {name!r} is not built: it is no class of {', '.join(TRUSTED_PACKAGES)}*")
+    if not callable(target) or not f"{getattr(target, '__module__', '')}.".startswith(TRUSTED_PACKAGES):
+        raise UntrustedTargetError(f"_target_ {name!r} is not built: {', '.join(TRUSTED_PACKAGES)}* do not define it")
     return target
 
 

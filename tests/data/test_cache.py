@@ -98,7 +98,9 @@ def test_a_lost_or_truncated_file_is_made_again(tmp_path, file, left):
     torch.testing.assert_close(maps[6], encode(SMALL.vertex_map(again.scan(6).points)))
 
 
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # fork beside torch's threads, from Python 3.12 on
+@pytest.mark.filterwarnings(
+    "ignore:This process:DeprecationWarning"
+)  # fork beside torch's threads, from Python 3.12 on
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_a_damaged_scan_is_named_also_from_a_worker(tmp_path, num_workers):
     with pytest.raises(UserError, match=r"scan\.bin: it is truncated") as raised:
@@ -128,7 +130,9 @@ def _build(root, start, results):
     results.put((len(sequence.read), int(np.abs(maps[11].numpy()).sum())))
 
 
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # fork beside torch's threads, from Python 3.12 on
+@pytest.mark.filterwarnings(
+    "ignore:This process:DeprecationWarning"
+)  # fork beside torch's threads, from Python 3.12 on
 def test_two_processes_at_once_share_the_work_and_the_result(tmp_path):
     context = multiprocessing.get_context("fork")
     start, results = context.Event(), context.Queue()

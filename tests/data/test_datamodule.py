@@ -49,7 +49,9 @@ def test_batches_are_decoded_to_metres(tmp_path):
     torch.testing.assert_close(batch["T_ref_new"], expected)
 
 
-@pytest.mark.parametrize(("height", "width", "expected"), [(None, None, (16, 96)), (8, None, (8, 96)), (8, 48, (8, 48))])
+@pytest.mark.parametrize(
+    ("height", "width", "expected"), [(None, None, (16, 96)), (8, None, (8, 96)), (8, 48, (8, 48))]
+)
 def test_the_network_s_image_may_be_smaller_than_the_data_set_s(tmp_path, height, width, expected):
     module = make(tmp_path, height=height, width=width)
     assert (module.projection.height, module.projection.width) == expected
@@ -63,7 +65,9 @@ def test_labels_are_left_out_where_one_sequence_has_none(tmp_path):
     assert "T_ref_new" in next(iter(module.val_dataloader()[0]))
 
 
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # fork beside torch's threads, from Python 3.12 on
+@pytest.mark.filterwarnings(
+    "ignore:This process:DeprecationWarning"
+)  # fork beside torch's threads, from Python 3.12 on
 def test_workers_load_the_same(tmp_path):
     plain, loaded = make(tmp_path), make(tmp_path, num_workers=2)
     for a, b in zip(plain.val_dataloader()[0], loaded.val_dataloader()[0], strict=True):

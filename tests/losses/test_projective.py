@@ -108,9 +108,7 @@ def test_unused_pixels_do_not_matter(loss, pair):
 def test_icp_gradient_is_that_of_finite_differences(pair):
     """In double precision, away from the truth where |r| has kinks, with the association fixed by tiny steps."""
     reference, target = (m.double()[..., 8:24, :] for m in pair)
-    projection = type(SMALL)(
-        height=16, width=360, fov_up_deg=15.0 - 8 * 35 / 32, fov_down_deg=-20.0 + 8 * 35 / 32
-    )
+    projection = type(SMALL)(height=16, width=360, fov_up_deg=15.0 - 8 * 35 / 32, fov_down_deg=-20.0 + 8 * 35 / 32)
     start = (TRUTH * 0.5).requires_grad_()
     assert torch.autograd.gradcheck(
         lambda p: IcpLoss()(p, reference, target, projection).loss, (start,), eps=1e-9, atol=1e-4, rtol=1e-3
@@ -125,7 +123,7 @@ def test_weighted_gradient_is_that_of_reweighted_least_squares(pair):
     parameters = start.clone().requires_grad_()
     loss(parameters, reference, target, FINE).loss.backward()
 
-    normals = normal_map(reference)
+    normals = normal_map(reference, loss.normal_window, loss.max_range_jump, loss.max_roughness)
     at_start = reproject(se3.from_euler(start), target, FINE)
     weights = (-(at_start - reference).square().sum(1) / 0.5**2).exp()
     used = activated(reference) & activated(at_start) & activated(normals)

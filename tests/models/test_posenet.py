@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import nn
 
+from lidarlearn.geometry import se3
 from lidarlearn.models.posenet import ColumnWrappedConv2d, PoseNet, bounded_difference
 from tests.box_world import SMALL, cast
-from lidarlearn.geometry import se3
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ def build(name: str, *overrides: str, projection: str = "hdl64") -> ScanByScan:
 @cache
 def composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        return compose("evaluate", [*overrides, "device=cpu"])
+        return compose("evaluate", ["device=cpu", *overrides])
 
 
 def run(odometry: ScanByScan, scans: Iterable[Tensor]) -> list[Frame]:

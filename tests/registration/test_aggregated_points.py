@@ -107,7 +107,7 @@ def test_normals_kept_up_incrementally_equal_those_from_scratch(world):
             assert not actual.any()
         else:
             compared += 1
-            assert (actual @ expected).abs() > 0.999 or not actual.any() and _is_border(cloud.points, i)
+            assert (actual @ expected).abs() > 0.999 or (not actual.any() and _is_border(cloud.points, i))
     assert compared > 50
 
 

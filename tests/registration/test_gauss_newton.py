@@ -32,7 +32,9 @@ def register(gauss_newton: GaussNewton, scene: maps.Scene, perturbation: Tensor)
 def assert_all_found(result: RegistrationResult, scene: maps.Scene, grid: Tensor) -> None:
     distances, angles = maps.errors(result.T_world_lidar, scene.T_world_lidar)
     missed = (distances > 0.03) | (angles > 0.15)
-    assert not missed.any(), f"from {grid[missed].tolist()}: {distances[missed].tolist()} m, {angles[missed].tolist()} deg"
+    assert not missed.any(), (
+        f"from {grid[missed].tolist()}: {distances[missed].tolist()} m, {angles[missed].tolist()} deg"
+    )
     assert result.converged.all()
 
 

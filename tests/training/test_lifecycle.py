@@ -60,7 +60,7 @@ def test_the_images_that_were_promised(run):
 
 
 def test_a_checkpoint_is_plain_data_that_says_what_it_was_trained_on(run):
-    folder, best, loss = run
+    _folder, best, loss = run
     trained_on = torch.load(best, weights_only=True)["hyper_parameters"]["trained_on"]
     assert trained_on["data_name"] == "boxes"
     assert trained_on["data"]["_target_"] == "tests.box_world.BoxDrives"
@@ -89,7 +89,7 @@ def test_best_is_the_epoch_with_the_smallest_validation_error(run):
 
 
 def test_resuming_goes_on_at_the_right_epoch(run, tmp_path):
-    folder, best, loss = run
+    folder, _best, loss = run
     config = configured(
         tmp_path / "resumed",
         f"loss={loss}",
@@ -114,7 +114,7 @@ def test_resuming_where_nothing_is_left_says_so(run, tmp_path):
 
 
 def test_resuming_with_another_model_says_so(run, tmp_path):
-    folder, best, loss = run
+    _folder, best, loss = run
     config = configured(tmp_path / "r", f"loss={loss}", "model.backbone=resnet34", f"ckpt={best}", frames=5)
     with pytest.raises(UserError, match="trained with model"):
         train(config, data_name="boxes")
@@ -160,9 +160,9 @@ def test_a_part_of_the_validation_is_scored_as_far_as_it_goes(tmp_path):
 
 def test_an_image_that_scans_do_not_fill_is_told(tmp_path):
     config = configured(
-        tmp_path / "run", "trainer.max_epochs=1", "datamodule.height=64", "datamodule.width=720", frames=9
+        tmp_path / "run", "trainer.max_epochs=1", "datamodule.height=32", "datamodule.width=192", frames=9
     )
-    with pytest.warns(UserWarning, match=r"% of the 64x720 pixels(.|\n)*datamodule\.height"):
+    with pytest.warns(UserWarning, match=r"% of the 32x192 pixels(.|\n)*datamodule\.height"):
         train(config, data_name="boxes")
 
 

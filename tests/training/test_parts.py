@@ -39,7 +39,7 @@ def test_arguments_of_run_time_are_added():
     ],
 )
 def test_nothing_else_is_built(target):
-    with pytest.raises(UserError, match="is not built|does not exist"):
+    with pytest.raises(UserError, match=r"is not built|does not exist"):
         build({"_target_": target})
 
 
@@ -51,3 +51,15 @@ def test_a_missing_target_is_refused():
 def test_a_wrong_key_is_named_with_the_right_ones():
     with pytest.raises(UserError, match=r"sigma_n(.|\n)*sigma_m, normal_window"):
         build({"_target_": "lidarlearn.losses.weighted_icp.WeightedIcpLoss", "sigma_n": 0.2})
+
+
+@pytest.mark.parametrize(
+    ("node", "words"),
+    [
+        ({"_target_": "lidarlearn.models.posenet.PoseNet", "backbone": "resnet17"}, "resnet17"),
+        ({"_target_": "torch.optim.Adam", "lr": -1.0, "params": [torch.nn.Parameter(torch.zeros(3))]}, "learning rate"),
+    ],
+)
+def test_a_value_that_is_refused_says_why(node, words):
+    with pytest.raises(UserError, match=words):
+        build(node)

@@ -1,10 +1,11 @@
 """The progress bar, on a terminal and in a log file."""
 
 import re
-from types import SimpleNamespace
+from unittest.mock import create_autospec
 
 import pytest
 import torch
+from lightning.pytorch import LightningModule, Trainer
 
 from lidarlearn.training.progress import ProgressLines
 
@@ -16,21 +17,25 @@ def trainer():
         "val/avg_translation_error_percent": torch.tensor(3.456),
         "val/mean_relative_translation_error_m": torch.tensor(0.0789),
     }
-    return SimpleNamespace(current_epoch=0, max_epochs=2, num_training_batches=4, callback_metrics=metrics)
+    stand_in = create_autospec(Trainer, instance=True)
+    stand_in.current_epoch = 0
+    stand_in.max_epochs, stand_in.num_training_batches, stand_in.callback_metrics = 2, 4, metrics
+    return stand_in
 
 
 def run(bar, trainer):
-    bar.on_train_start(trainer, None)
+    module = LightningModule()
+    bar.on_train_start(trainer, module)
     for epoch in range(2):
         trainer.current_epoch = epoch
-        bar.on_train_epoch_start(trainer, None)
+        bar.on_train_epoch_start(trainer, module)
         for i in range(4):
-            bar.on_train_batch_end(trainer, None, {"loss": torch.tensor(0.5)}, None, i)
-        bar.on_train_epoch_end(trainer, None)
+            bar.on_train_batch_end(trainer, module, {"loss": torch.tensor(0.5)}, None, i)
+        bar.on_train_epoch_end(trainer, module)
 
 
 def test_in_a_log_file_one_line_an_epoch(trainer, capsys):
-    run(ProgressLines(seconds_between_lines=1000), trainer)
+    run(ProgressLines(seconds_between_lines=1000.0), trainer)
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2
     assert re.match(r"epoch 1/2 \[#{20}\] 100 %  loss 0\.125", lines[0])
@@ -39,7 +44,7 @@ def test_in_a_log_file_one_line_an_epoch(trainer, capsys):
 
 
 def test_a_long_epoch_writes_lines_within(trainer, capsys):
-    run(ProgressLines(seconds_between_lines=0), trainer)
+    run(ProgressLines(seconds_between_lines=0.0), trainer)
     lines = capsys.readouterr().out.splitlines()
     shares = [int(re.search(r"(\d+) %", line)[1]) for line in lines]
     assert shares == [25, 50, 75, 100, 25, 50, 75, 100]
@@ -54,7 +59,7 @@ def test_on_a_terminal_the_bar_moves_in_place(trainer, capsys, monkeypatch):
 
 
 def test_the_other_processes_of_a_run_are_silent(trainer, capsys):
-    bar = ProgressLines(0)
+    bar = ProgressLines(0.0)
     bar.disable()
     run(bar, trainer)
     assert capsys.readouterr().out == ""

@@ -1,6 +1,6 @@
 """PoseNet as an initialization."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -11,6 +11,7 @@ from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
 
 
+@runtime_checkable
 class TrainedNetwork(Protocol):
     """What is needed of a network: its image, and the relative pose it sees in two of them."""
 

@@ -1,0 +1,122 @@
+"""`python train.py` as users call it."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.run_folder import git_revision
+from lidarlearn.commands.train import evaluate_command
+from lidarlearn.training.checkpoints import load_checkpoint
+from tests.training.runs import curves
+
+TRAIN = Path(__file__).parents[2] / "train.py"
+SMALL = (
+    "data.frames=18", "data.train_sequences=[urban_00,urban_01]", "data.val_sequences=[urban_02]", "data.workers=0",
+    "device=cpu", "datamodule.preparation_workers=0", "datamodule.batch_size=4", "datamodule.height=16",
+    "datamodule.width=90", "datamodule.mirror=false", "~callbacks.images",
+)  # fmt: skip
+
+
+def command(folder: Path, *arguments: str) -> list[str]:
+    run = () if any(a.startswith("hydra.run.dir") for a in arguments) else (f"hydra.run.dir={folder}/run",)
+    return [
+        sys.executable, str(TRAIN), *SMALL, f"data.root={folder}/data", f"datamodule.cache_root={folder}/cache", *run,
+        *arguments,
+    ]  # fmt: skip
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(TRAIN.parent)}
+
+
+def call(folder: Path, *arguments: str) -> str:
+    done = subprocess.run(command(folder, *arguments), env=environment(), capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+def test_configs_are_found():
+    assert (config_directory() / "train.yaml").is_file()
+
+
+def test_the_revision_is_a_commit_or_unknown():
+    assert re.fullmatch(r"[0-9a-f]{40}(-modified)?|unknown", git_revision())
+
+
+@pytest.mark.parametrize(
+    ("path", "printed"),
+    [
+        ("runs/a/best.ckpt", "ckpt=runs/a/best.ckpt"),
+        ("runs/a b/best.ckpt", """'ckpt="runs/a b/best.ckpt"'"""),
+        ("runs/lr=0.1,x/best.ckpt", """'ckpt="runs/lr=0.1,x/best.ckpt"'"""),
+    ],
+)
+def test_the_command_that_is_printed_survives_shell_and_hydra(path, printed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert evaluate_command(tmp_path / path) == f"lidarlearn-evaluate {printed}"
+    (tmp_path / "evaluate.py").touch()
+    assert evaluate_command(tmp_path / path) == f"python evaluate.py {printed}"
+
+
+@pytest.mark.slow
+def test_missing_data_is_one_readable_error(tmp_path):
+    arguments = [
+        "data=kitti_00-08",
+        "loss=weighted_icp",
+        f"data.root={tmp_path}/nowhere",
+        f"hydra.run.dir={tmp_path}/run",
+    ]
+    done = subprocess.run(
+        [sys.executable, str(TRAIN), *arguments], env=environment(), capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stdout + done.stderr
+    assert all(word in done.stderr for word in ("KITTI", "data.root", "nowhere", "http"))
+
+
+@pytest.mark.slow
+def test_a_training_tells_its_progress_and_what_to_do_next(tmp_path):
+    out = call(tmp_path, "trainer.max_epochs=2")
+    assert re.search(r"epoch 2/2 \[#+\] 100 %  loss [0-9.e-]+", out)
+    assert "evaluate ckpt=run/checkpoints/best.ckpt" in out
+    assert "Warning" not in out and "GPU available" not in out
+
+
+@pytest.mark.slow
+def test_a_killed_training_resumes_at_its_epoch(tmp_path):
+    checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    process = subprocess.Popen(
+        command(tmp_path, "trainer.max_epochs=1000"), env=environment(), cwd=tmp_path, stdout=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 300
+    while not checkpoint.exists() and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.05)
+    time.sleep(1.5)  # into some later epoch
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = load_checkpoint(checkpoint)["epoch"] + 1
+    out = call(tmp_path, f"trainer.max_epochs={done + 2}", f"ckpt={checkpoint}", f"hydra.run.dir={tmp_path}/resumed")
+    assert [int(e) for e in re.findall(rf"epoch +(\d+)/{done + 2} .*100 %", out)] == [done + 1, done + 2]
+    after = load_checkpoint(tmp_path / "resumed" / "checkpoints" / "last.ckpt")
+    assert after["epoch"] == done + 1 and after["global_step"] == (done + 2) * 8
+
+
+@pytest.mark.slow
+def test_two_processes_train_like_one(tmp_path):
+    """Same seed, same global batch: only batch statistics and the order of the pairs differ."""
+    one = ("trainer.max_epochs=2", "datamodule.batch_size=8", f"hydra.run.dir={tmp_path}/one")
+    call(tmp_path, *one)
+    out = call(tmp_path, *one[:1], "trainer.devices=2", "trainer.strategy=ddp", f"hydra.run.dir={tmp_path}/two")
+    a, b = curves(tmp_path / "one"), curves(tmp_path / "two")
+    assert [step for step, _ in a["train/loss_epoch"]] == [step for step, _ in b["train/loss_epoch"]]
+    first_a, first_b = a["train/loss_epoch"][0][1], b["train/loss_epoch"][0][1]
+    assert first_b == pytest.approx(first_a, rel=0.3)
+    assert b["val/error"][-1][1] > 0
+    assert out.count("next:") == 1

@@ -1,0 +1,127 @@
+"""What a run leaves behind: trajectories, health records and a summary, from which alone everything is scored."""
+
+import csv
+import json
+
+import pytest
+import torch
+
+from lidarlearn.data.sequence import Scan
+from lidarlearn.errors import UserError
+from lidarlearn.evaluation.run import Export, read_export, run_odometry, summarize_health
+from lidarlearn.geometry import se3
+from lidarlearn.odometry.health import Health
+from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
+from tests.evaluation.conftest import DriveWithoutScans
+
+
+class Numbered(DriveWithoutScans):
+    """Scan i holds i + 1 points with times; one of them may be damaged."""
+
+    damaged: int | None = None
+
+    def scan(self, index: int) -> Scan:
+        if index == self.damaged:
+            raise UserError(f"scan {index} is damaged")
+        return Scan(torch.full((index + 1, 3), 5.0), torch.zeros(index + 1))
+
+
+class OneMetreAScan(ScanByScan):
+    """Says it moved by a metre, and remembers what it was fed with."""
+
+    def __init__(self) -> None:
+        self.fed: list[tuple[int, bool]] = []
+
+    def register_scan(self, points, times=None) -> Frame:
+        T = se3.identity()
+        T[0, 3] = len(self.fed)
+        self.fed.append((len(points), times is not None))
+        return Frame(T, Health(len(self.fed) - 1, points=len(points)))
+
+
+@pytest.fixture
+def sequence(make_drive, T_camera_lidar) -> Numbered:
+    sequence = Numbered("04", make_drive(6), 6, 0.1 * torch.arange(6, dtype=torch.float64), T_camera_lidar)
+    return sequence
+
+
+@pytest.mark.parametrize("deskew", [False, True])
+def test_every_scan_is_fed_in_order_and_times_only_where_asked_for(sequence, tmp_path, deskew):
+    odometry, advanced = OneMetreAScan(), []
+    run_odometry(odometry, sequence, Export(tmp_path, "04"), deskew, lambda: advanced.append(1))
+    assert odometry.fed == [(i + 1, deskew) for i in range(6)]
+    assert len(advanced) == 6
+
+
+def test_poses_come_back_as_they_were(sequence, tmp_path):
+    export = Export(tmp_path, "04")
+    run_odometry(OneMetreAScan(), sequence, export)
+    poses, summary = read_export(export, sequence)
+    expected = se3.identity(6)
+    expected[:, 0, 3] = torch.arange(6)
+    torch.testing.assert_close(poses, expected, rtol=0, atol=1e-8)
+    assert summary["frames_per_second"] > 0
+    assert summary["health"]["flagged"] == 0
+
+
+def test_files_are_in_the_frame_of_the_data_set(sequence, tmp_path):
+    """KITTI's camera looks along z: driving forward is motion along its third axis."""
+    export = Export(tmp_path, "04")
+    run_odometry(OneMetreAScan(), sequence, export)
+    rows = [[float(x) for x in line.split()] for line in export.kitti.read_text().splitlines()]
+    assert len(rows) == 6 and len(rows[0]) == 12
+    assert rows[0] == pytest.approx([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0], abs=1e-12)
+    assert rows[5][11] == pytest.approx(5, abs=0.01)
+    stamps = [float(line.split()[0]) for line in export.tum.read_text().splitlines() if not line.startswith("#")]
+    assert stamps == pytest.approx([0.1 * i for i in range(6)])
+
+
+def test_a_row_of_health_for_every_scan(sequence, tmp_path):
+    export = Export(tmp_path, "04")
+    run_odometry(OneMetreAScan(), sequence, export)
+    with export.health.open(newline="") as file:
+        assert [int(row["points"]) for row in csv.DictReader(file)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_what_came_before_a_damaged_scan_is_exported_as_partial(sequence, tmp_path):
+    sequence.damaged = 3
+    export = Export(tmp_path, "04")
+    with pytest.raises(UserError, match="scan 3 is damaged"):
+        run_odometry(OneMetreAScan(), sequence, export)
+    assert not export.kitti.exists()
+    assert len((tmp_path / "04.partial.txt").read_text().splitlines()) == 3
+    assert json.loads((tmp_path / "04.partial.json").read_text())["frames_per_second"] > 0
+
+
+def test_a_damaged_first_scan_leaves_nothing(sequence, tmp_path):
+    sequence.damaged = 0
+    with pytest.raises(UserError):
+        run_odometry(OneMetreAScan(), sequence, Export(tmp_path, "04"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_sequences_without_time_stamps_and_without_truth_are_exported(tmp_path):
+    sequence = Numbered("x", None, 3)
+    run_odometry(OneMetreAScan(), sequence, Export(tmp_path, "x"))
+    poses, _ = read_export(Export(tmp_path, "x"), sequence)
+    assert poses[:, 0, 3].tolist() == [0, 1, 2]
+
+
+def test_the_summary_counts_what_was_flagged_after_the_first_scan():
+    records = [
+        Health(0, status="coasted"),
+        Health(1, iterations=4, rmse_m=0.02, inlier_share=0.9),
+        Health(2, status="recovered", implausible=True, iterations=8, rmse_m=0.04, inlier_share=0.7),
+        Health(3, status="coasted", degenerate=True, iterations=0, rmse_m=0.0, inlier_share=0.5),
+        Health(4, status="restarted", iterations=0, rmse_m=0.0, inlier_share=0.5),
+    ]
+    summary = summarize_health(records)
+    assert summary["flagged"] == 3 and summary["recovered"] == 1 and summary["coasted"] == 2
+    assert summary["degenerate"] == 1 and summary["implausible"] == 1
+    assert summary["mean_iterations"] == 3 and summary["mean_rmse_m"] == pytest.approx(0.015)
+    assert summary["mean_inlier_share"] == pytest.approx(0.65)
+
+
+def test_means_over_nothing_are_none():
+    assert summarize_health([Health(0)])["mean_rmse_m"] is None
+    assert summarize_health([])["mean_iterations"] is None and summarize_health([])["flagged"] == 0

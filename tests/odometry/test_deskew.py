@@ -1,0 +1,61 @@
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.odometry.deskew import deskew
+from lidarlearn.simulation import scenes
+from lidarlearn.simulation.drive import Drive
+from lidarlearn.simulation.sensors import Sensor
+
+MOTION = se3.exp(torch.tensor([1.3, 0.1, -0.05, 0.01, -0.02, 0.09], dtype=torch.float64))
+QUIET = Sensor("quiet", tuple(float(e) for e in range(10, -20, -2)), 256, range_noise=0.0, drop_out=0.0, reach=math.inf)
+
+
+def slow_deskew(points: Tensor, times: Tensor, T_previous_new: Tensor) -> Tensor:
+    """Point by point: where the sensor was at its instant, as a share of the motion."""
+    twist = se3.log(T_previous_new)
+    moved = [
+        se3.transform(se3.exp(t * twist), p[None].double())[0] for p, t in zip(points, times.double(), strict=True)
+    ]
+    return torch.stack(moved)
+
+
+@pytest.mark.parametrize("interval", [(-0.5, 0.5), (0.0, 1.0), (-1.0, 0.0)])
+def test_agrees_with_the_motion_of_each_point(interval):
+    generator = torch.Generator().manual_seed(0)
+    points = 20 * torch.randn(500, 3, generator=generator)
+    times = torch.empty(500).uniform_(*interval, generator=generator)
+    expected = slow_deskew(points, times, MOTION)
+    assert (deskew(points, times, MOTION).double() - expected).norm(dim=1).max() < 0.012
+
+
+def test_a_distorted_scan_becomes_the_one_taken_at_an_instant():
+    """Every point lies on the room's floor, ceiling or walls again."""
+    path = scenes.straight_path(7, 0.8, start=-3.0, yaw_step=0.08)
+    drive = Drive(scenes.room(height=4.0), poses=path, sensor=QUIET, motion_distortion=True)
+    scan, T_world_lidar = drive.scan(3), torch.from_numpy(path[3])
+    motion = se3.inverse(torch.from_numpy(path[2])) @ T_world_lidar
+
+    def off_the_shell(points: Tensor) -> Tensor:
+        x, y, z = se3.transform(T_world_lidar, points.double()).unbind(-1)
+        shell = torch.stack([(x.abs() - 10).abs(), (y.abs() - 7).abs(), z.abs(), (z - 4).abs()]).amin(0)
+        return shell[(x.abs() > 7.5) | (y.abs() > 6)]  # where there is no furniture
+
+    assert off_the_shell(scan.points).quantile(0.9) > 0.2
+    assert off_the_shell(deskew(scan.points, scan.times, motion)).quantile(0.99) < 0.02
+
+
+def test_without_times_or_points_or_motion_nothing_changes():
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    assert deskew(points, None, MOTION) is points
+    assert deskew(points[:0], torch.zeros(0), MOTION).shape == (0, 3)
+    torch.testing.assert_close(deskew(points, torch.rand(50), se3.identity()), points)
+
+
+def test_points_of_one_instant_move_together():
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    half = se3.exp(0.5 * se3.log(MOTION))
+    torch.testing.assert_close(deskew(points, torch.full((50,), 0.5), MOTION), se3.transform(half, points))

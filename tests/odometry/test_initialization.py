@@ -1,0 +1,92 @@
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.odometry.initialization import ConstantVelocity, ElevationImage, NoInitialization
+from lidarlearn.odometry.initialization.posenet import PoseNetInitialization
+from lidarlearn.simulation.drive import Drive
+from lidarlearn.simulation.sensors import hdl64
+
+LAST = se3.exp(torch.tensor([1.2, 0.1, 0, 0.01, 0, 0.05], dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def urban() -> Drive:
+    return Drive("urban", seed=1, frames=6, speed=10.0, static=True, sensor=hdl64(columns=1024))
+
+
+def test_none_is_the_identity_and_constant_velocity_the_last_motion():
+    points = torch.randn(10, 3)
+    none, constant = NoInitialization().predict(points, LAST), ConstantVelocity().predict(points, LAST)
+    assert torch.equal(none.T_previous_new, se3.identity()) and none.source == "ni"
+    assert torch.equal(constant.T_previous_new, LAST) and constant.source == "cv"
+
+
+def test_elevation_images_recover_the_motion_in_the_plane(urban):
+    elevation = ElevationImage()
+    first = elevation.predict(urban.scan(0).points, LAST)
+    assert first.source == "cv"
+    for i in range(1, 6):
+        guess = elevation.predict(urban.scan(i).points, se3.identity())
+        assert guess.source == "ei"
+        error = se3.to_euler(se3.inverse(se3.relative(urban.T_world_lidar)[i - 1]) @ guess.T_previous_new)
+        assert error[:2].norm() < 0.25 and error[5].abs() < math.radians(0.7)
+        assert guess.T_previous_new.dtype == torch.float64
+        assert se3.to_euler(guess.T_previous_new)[2:5].abs().max() == 0
+
+
+@pytest.mark.parametrize("yaw_deg", [-20.0, 8.0])
+def test_elevation_images_see_turns_on_the_spot(urban, yaw_deg):
+    elevation, points = ElevationImage(), urban.scan(0).points
+    T_previous_new = se3.from_euler(torch.tensor([0.5, -0.3, 0, 0, 0, math.radians(yaw_deg)], dtype=torch.float64))
+    elevation.predict(points, LAST)
+    guess = elevation.predict(se3.transform(se3.inverse(T_previous_new), points), LAST)
+    error = se3.to_euler(se3.inverse(T_previous_new) @ guess.T_previous_new)
+    assert guess.source == "ei"
+    assert error[:2].norm() < 0.2 and error[5].abs() < math.radians(0.5)
+
+
+@pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[3.0, 1, 0.5]]), torch.full((500, 3), -1.0)])
+def test_elevation_images_without_features_fall_back_to_constant_velocity(urban, points):
+    elevation = ElevationImage()
+    elevation.predict(urban.scan(0).points, LAST)
+    guess = elevation.predict(points, LAST)
+    assert guess.source == "cv" and torch.equal(guess.T_previous_new, LAST)
+    after = elevation.predict(urban.scan(1).points, LAST)
+    assert after.source == "cv"
+
+
+def test_the_elevation_image_holds_the_greatest_height_above_the_sensor_in_each_cell():
+    elevation = ElevationImage(size_px=10, pixel_m=1.0, max_height_m=10.0)
+    points = torch.tensor([[0.5, 0.5, 2.0], [0.6, 0.4, 5.0], [-4.5, 3.5, 20.0], [2.5, 2.5, -1.0], [7.0, 0.0, 3.0]])
+    image = elevation.image(points)
+    assert image.shape == (10, 10) and image.dtype == "uint8"
+    assert image[5, 5] == 1 + int(5.0 * 25.4) and image[8, 0] == 255
+    assert (image > 0).sum() == 2
+
+
+class _Network:
+    """Stands in for a trained network: says how many pixels of the two images were activated."""
+
+    projection = SphericalProjection()
+    device = torch.device("cpu")
+
+    def relative_pose(self, reference: Tensor, target: Tensor) -> Tensor:
+        T = se3.identity(len(reference))
+        T[:, 0, 3] = (reference != 0).any(dim=1).sum()
+        T[:, 1, 3] = (target != 0).any(dim=1).sum()
+        return T
+
+
+def test_posenet_is_shown_the_previous_scan_and_the_new_one(urban):
+    initialization = PoseNetInitialization(_Network())
+    counts = [(_Network.projection.nearest_points(urban.scan(i).points) >= 0).sum() for i in range(3)]
+    first = initialization.predict(urban.scan(0).points, LAST)
+    assert torch.equal(first.T_previous_new, se3.identity()) and first.source == "posenet"
+    for i in (1, 2):
+        guess = initialization.predict(urban.scan(i).points, LAST)
+        assert guess.T_previous_new[:2, 3].tolist() == [counts[i - 1], counts[i]]
