@@ -57,7 +57,8 @@ def test_every_experiment_that_trains_composes(path):
 def test_kitti_is_trained_as_in_the_paper():
     config = composed("data=kitti_00-08", "loss=weighted_icp")
     assert config.optimizer["_target_"] == "torch.optim.Adam" and config.optimizer.lr == 1e-4
-    assert (config.trainer.max_epochs, config.scheduler.step_size, config.scheduler.gamma) == (100, 20, 0.5)
+    assert (config.trainer.max_epochs, config.scheduler.gamma) == (100, 0.5)
+    assert config.scheduler.milestones == [20, 40, 60, 80]
     assert config.model.backbone == "resnet18" and config.loss.sigma_m == 0.5
     assert (config.datamodule.height, config.data.projection.height, config.data.projection.width) == (None, 64, 720)
 
