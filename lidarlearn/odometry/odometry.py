@@ -95,7 +95,7 @@ class Odometry(ScanByScan):
         return Health(self._frames, status=status, points=len(scan.points))
 
     def _deskew_first(self, scan: PreparedScan, T_previous_new: Tensor) -> None:
-        """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the trajectory."""
+        """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the poses."""
         first, self._first = self._first, None
         if first is None or first.times is None or not self._has_enough_points(scan):
             return

@@ -38,7 +38,8 @@ def build(node: Mapping[str, Any], **arguments: Any) -> Any:
     try:
         return target(**merged)
     except (TypeError, ValueError) as error:  # a value that the constructor refuses
-        raise UserError(f"{name}: {error}\n  it was given {_without(arguments, merged)}") from error
+        given = {key: value for key, value in merged.items() if key not in arguments}
+        raise UserError(f"{name}: {error}\n  it was given {given}") from error
 
 
 def require_trusted(node: object) -> None:
