@@ -156,12 +156,15 @@ class GaussNewton:
         squared_distances = (points_world - map_points).square().sum(-1)
         w = self.weight.weight(size / widening, squared_distances / widening**2) * mask
         J = linear.jacobians.flatten(-3, -2)
-        wJ = (linear.jacobians * w[..., None, None]).flatten(-3, -2)
+        weights = w.repeat_interleave(linear.residuals.shape[-1], dim=-1)
+        # Summed in single precision, H would no longer tell "nothing is known" from its own rounding.
+        J64 = J.double()
+        wJ = J64 * weights[..., None]
         return _System(
             jacobians=J,
-            weights=w.repeat_interleave(linear.residuals.shape[-1], dim=-1),
-            H=(wJ.mT @ J).double(),
-            g=(wJ.mT @ linear.residuals.flatten(-2)[..., None]).double()[..., 0],
+            weights=weights,
+            H=wJ.mT @ J64,
+            g=(wJ.mT @ linear.residuals.flatten(-2)[..., None].double())[..., 0],
             weight=w.sum(-1).double(),
             neighbours=mask.sum(-1),
             inliers=(mask & (size < self.inlier_residual_m)).sum(-1),
@@ -222,9 +225,9 @@ class _Position:
 
 
 def _position(system: _System) -> _Position:
-    # A ridge far below any information keeps an empty system solvable, and above the rounding of single precision it
+    # A ridge far below any information keeps an empty system solvable, and above the rounding of the Jacobians it
     # holds what nothing is known of, such as the yaw on a bare plane.
-    H = torch.nan_to_num(system.H)
+    H = torch.nan_to_num(0.5 * (system.H + system.H.mT))
     blocks = H.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 3)).mean(-1)  # of translation and of rotation
     ridge = torch.diag_embed(1e-6 * blocks.repeat_interleave(3, dim=-1) + 1e-9)
     # 6x6 and on the critical path: a GPU's solvers would cost more than the trip.

@@ -22,6 +22,7 @@ SMALL = hdl64(columns=512)
 SENSORS = {"hdl64": hdl64(columns=1024), "hdl32": hdl32(), "vlp16": vlp16(), "os1_64": os1_64()}
 slow = pytest.mark.slow
 all_associations = pytest.mark.parametrize("association", ["kd", "p", pytest.param("vh", marks=slow)])
+kd_at_least = pytest.mark.parametrize("association", ["kd", *(pytest.param(a, marks=slow) for a in ("p", "vh"))])
 
 
 FRAMES = 13
@@ -54,7 +55,7 @@ def test_drives_are_followed_from_the_first_frame(association, map_, yaw_step):
 
 
 @pytest.mark.parametrize("initialization", ["ni", "cv", "ei"])
-@all_associations
+@kd_at_least
 def test_every_initialization_drives_every_backend(initialization, association):
     drive = street()
     frames = run(build(f"{initialization}+{association}_f2m"), scans()[:6])
@@ -65,7 +66,7 @@ def test_every_initialization_drives_every_backend(initialization, association):
 
 
 @pytest.mark.parametrize("speed", [0.0, *(pytest.param(v, marks=slow) for v in (4.0, 12.0, 20.0)), 27.0])
-@all_associations
+@kd_at_least
 def test_any_speed_is_found_at_the_start(association, speed):
     drive = street(4, step=speed / 10)
     frames = run(build(f"cv+{association}_f2m"), scans_of(drive))
@@ -75,7 +76,7 @@ def test_any_speed_is_found_at_the_start(association, speed):
 
 
 @pytest.mark.parametrize("name", ["vlp16", pytest.param("hdl32", marks=slow), pytest.param("os1_64", marks=slow)])
-@all_associations
+@kd_at_least
 def test_any_spinning_lidar(association, name):
     drive = street(6, sensor=SENSORS[name])
     frames = run(build(f"cv+{association}_f2m", projection=name), scans_of(drive))
@@ -129,7 +130,7 @@ def test_a_scan_without_content_is_flagged_and_survived(association, disturbed):
     assert frames[AT].health.status == "coasted"
 
 
-@all_associations
+@kd_at_least
 def test_points_that_are_not_finite_are_left_out(association):
     frames = run(build(f"cv+{association}_f2m"), drive_with(not_finite(scans()[AT])))
     translations, _ = motion_errors(poses(frames), street().T_world_lidar)
@@ -162,7 +163,7 @@ def test_a_turn_by_20_degrees_from_one_scan_to_the_next_is_flagged_and_recovered
     assert error[:3, 3].norm() < 0.1 and se3.rotation_angle(error).rad2deg() < 0.5
 
 
-@all_associations
+@kd_at_least
 def test_a_world_turned_for_good_is_followed(association):
     """From one frame on every scan is turned: the sensor was knocked."""
     T_straight_turned = se3.from_euler(torch.tensor([0, 0, 0, 0, 0, math.radians(20)], dtype=torch.float64))
@@ -173,7 +174,7 @@ def test_a_world_turned_for_good_is_followed(association):
     assert_recovers(frames, true)
 
 
-@all_associations
+@kd_at_least
 @pytest.mark.parametrize("lead", [pytest.param(1, marks=slow), 3])
 def test_a_drive_that_begins_with_empty_scans_starts_when_there_is_something_to_see(association, lead):
     frames = run(build(f"cv+{association}_f2m"), [*[torch.zeros(0, 3)] * lead, *scans()[:6]])
@@ -182,7 +183,7 @@ def test_a_drive_that_begins_with_empty_scans_starts_when_there_is_something_to_
     assert translations.max() < 0.03
 
 
-@all_associations
+@kd_at_least
 def test_after_a_long_gap_a_new_map_is_begun_and_said_so(association):
     gap = [torch.zeros(0, 3)] * 6
     frames = run(build(f"cv+{association}_f2m"), [*scans()[:3], *gap, *scans()[9:]])
@@ -213,7 +214,7 @@ def test_an_endless_corridor_is_flagged_along_its_axis_from_the_first_registered
     assert drift[:, :2].norm(dim=1).max() < 0.1 and drift[:, 2:].norm(dim=1).rad2deg().max() < 1.0
 
 
-@all_associations
+@kd_at_least
 @pytest.mark.parametrize("sensor", ["hdl64", pytest.param("hdl32", marks=slow)])
 def test_an_open_street_is_not_flagged(association, sensor):
     frames = run(build(f"cv+{association}_f2m", projection=sensor), scans_of(in_scene("street", sensor)))
@@ -232,7 +233,7 @@ def test_noisier_sensors_see_a_corridor_too(association, name, sensor):
 # --- motion within a scan -------------------------------------------------------------------------------------------
 
 
-@all_associations
+@kd_at_least
 def test_deskewing_mends_a_distorted_drive(association):
     path = scenes.straight_path(12, 1.2, yaw_step=0.05)
     drive = Drive(scenes.street(), poses=path, frames=9, sensor=SMALL, motion_distortion=True)
@@ -293,7 +294,7 @@ def held_bytes(thing: object, seen: set[int]) -> int:
     return held_bytes(vars(thing), seen) if hasattr(thing, "__dict__") else 0
 
 
-@all_associations
+@kd_at_least
 def test_what_an_odometry_holds_stops_growing_when_its_window_is_full(association):
     odometry = build(f"cv+{association}_f2m", f"odometry.{association}_f2m.local_map.size=3", *TINY_IMAGE)
     held = [held_bytes(odometry, set()) for _ in looping(odometry, 40)]
@@ -318,7 +319,7 @@ def test_memory_is_flat_over_3000_frames(association):
 # --- small print ----------------------------------------------------------------------------------------------------
 
 
-@all_associations
+@kd_at_least
 def test_the_same_scans_give_the_same_poses(association):
     first, again = (poses(run(build(f"cv+{association}_f2m"), scans()[:6])) for _ in range(2))
     assert torch.equal(first, again)
