@@ -21,7 +21,6 @@ from tests.odometry.odometries import ASSOCIATIONS, build, motion_errors, poses,
 SMALL = hdl64(columns=512)
 SENSORS = {"hdl64": hdl64(columns=1024), "hdl32": hdl32(), "vlp16": vlp16(), "os1_64": os1_64()}
 slow = pytest.mark.slow
-all_associations = pytest.mark.parametrize("association", ["kd", "p", pytest.param("vh", marks=slow)])
 kd_at_least = pytest.mark.parametrize("association", ["kd", *(pytest.param(a, marks=slow) for a in ("p", "vh"))])
 
 
@@ -114,7 +113,7 @@ def not_finite(points: Tensor) -> Tensor:
     return bad
 
 
-@all_associations
+@kd_at_least
 @pytest.mark.parametrize(
     "disturbed",
     [
@@ -137,7 +136,7 @@ def test_points_that_are_not_finite_are_left_out(association):
     assert translations.max() < 0.03
 
 
-@all_associations
+@kd_at_least
 def test_a_repeated_scan_is_flagged_and_recovered_from(association):
     frames = run(build(f"cv+{association}_f2m"), drive_with(scans()[AT - 1]))
     assert_recovers(frames, street().T_world_lidar)
@@ -145,14 +144,14 @@ def test_a_repeated_scan_is_flagged_and_recovered_from(association):
     assert moved[:3, 3].norm() < 0.1
 
 
-@all_associations
+@kd_at_least
 def test_a_dropped_scan_is_flagged_and_recovered_from(association):
     kept = [i for i in range(FRAMES) if i != AT]
     frames = run(build(f"cv+{association}_f2m"), [scans()[i] for i in kept])
     assert_recovers(frames, street().T_world_lidar[kept])
 
 
-@all_associations
+@kd_at_least
 def test_a_turn_by_20_degrees_from_one_scan_to_the_next_is_flagged_and_recovered_from(association):
     T_straight_turned = se3.from_euler(torch.tensor([0, 0, 0, 0, 0, math.radians(20)], dtype=torch.float64))
     turned = se3.transform(se3.inverse(T_straight_turned), scans()[AT])
@@ -202,7 +201,7 @@ def in_scene(name: str, sensor: str) -> Drive:
     return Drive(world, poses=scenes.straight_path(6, 1.2), frames=6, sensor=SENSORS[sensor])
 
 
-@pytest.mark.parametrize("association", ASSOCIATIONS)
+@kd_at_least
 @pytest.mark.parametrize("sensor", ["hdl64", pytest.param("hdl32", marks=slow)])
 @pytest.mark.parametrize("name", ["corridor", "tunnel"])
 def test_an_endless_corridor_is_flagged_along_its_axis_from_the_first_registered_frame(association, name, sensor):
@@ -222,7 +221,7 @@ def test_an_open_street_is_not_flagged(association, sensor):
 
 
 @pytest.mark.slow
-@all_associations
+@kd_at_least
 @pytest.mark.parametrize("sensor", ["vlp16", "os1_64"])
 @pytest.mark.parametrize("name", ["corridor", "tunnel"])
 def test_noisier_sensors_see_a_corridor_too(association, name, sensor):
@@ -352,7 +351,7 @@ def test_without_recovery_a_surprise_is_still_flagged():
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@all_associations
+@kd_at_least
 def test_cuda_gives_the_poses_of_the_cpu(association):
     on_cpu = poses(run(build(f"cv+{association}_f2m"), scans()[:8]))
     on_gpu = poses(run(build(f"cv+{association}_f2m", "device=cuda"), scans()[:8]))

@@ -19,7 +19,10 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard"
 EPOCHS, FRAMES = 3, 33  # two drives of 32 pairs: eight batches of eight an epoch
 
 
-@pytest.fixture(scope="module", params=["weighted_icp", "icp", "supervised"])
+LOSSES = ["weighted_icp", *(pytest.param(loss, marks=pytest.mark.slow) for loss in ("icp", "supervised"))]
+
+
+@pytest.fixture(scope="module", params=LOSSES)
 def run(request, tmp_path_factory):
     """A finished training with each of the losses."""
     folder = tmp_path_factory.mktemp(request.param) / "run"
@@ -123,7 +126,7 @@ def test_resuming_with_another_model_says_so(run, tmp_path):
 def test_two_runs_from_one_seed_are_the_same(tmp_path):
     losses = []
     for name in ("a", "b"):
-        config = configured(tmp_path / name, "trainer.max_epochs=1", "seed=7", frames=17)
+        config = configured(tmp_path / name, "trainer.max_epochs=1", "seed=7", frames=9)
         train(config, data_name="boxes")
         losses.append(curves(tmp_path / name)["train/loss_step"])
     assert losses[0] == losses[1]
