@@ -31,7 +31,7 @@ class Judgement:
     min_overlap: float = 0.03
     min_inlier_share: float = 0.6
     min_fit_share: float = 0.7
-    min_information: float = 0.005
+    min_information: float = 0.01
     max_deviation_m: float = 0.5
     max_deviation_deg: float = 8.0
     restart_after: int = 5
