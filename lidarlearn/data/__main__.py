@@ -1,5 +1,5 @@
-"""`python -m lidarlearn.data check ...`, see `lidarlearn.commands.check_data`."""
+"""`python -m lidarlearn.data check|export ...`, see `lidarlearn.commands.data`."""
 
-from lidarlearn.commands.check_data import main
+from lidarlearn.commands.data import main
 
 main()

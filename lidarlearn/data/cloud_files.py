@@ -9,7 +9,7 @@ from typing import Any
 import meshio.ply
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from meshio import ReadError
 from numpy.typing import NDArray
 from pypcd4 import PointCloud
@@ -32,11 +32,15 @@ class Cloud:
         points: float32 [m], finite, without the origin: it stands for "no return".
         intensities: as they stand; None where there are none.
         times: as they stand, in the file's unit and from its origin, float64; None where there are none.
+        rows: place of each point among the file's, those that did not return counted.
+        file_rows: how many the file holds.
     """
 
     points: Float[Tensor, "n 3"]
     intensities: Float[Tensor, "n"] | None
     times: Float[Tensor, "n"] | None
+    rows: Int[Tensor, "n"]
+    file_rows: int
 
 
 def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
@@ -76,7 +80,7 @@ def _cloud(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
         next((torch.from_numpy(np.asarray(fields[n]).astype(dtype))[returned] for n in names if n in fields), None)
         for names, dtype in ((_INTENSITY_NAMES, np.float32), (_TIME_NAMES, np.float64))
     )
-    return Cloud(points[returned], intensities, times)
+    return Cloud(points[returned], intensities, times, returned.nonzero()[:, 0], len(points))
 
 
 def _columns(rows: NDArray[np.float32]) -> dict[str, NDArray[Any]]:

@@ -1,10 +1,18 @@
-"""Poses between poses."""
+"""Poses between poses, and scans between them."""
 
+import logging
+
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarlearn.data.scan_files import ScanFiles
 from lidarlearn.geometry import se3
+
+_log = logging.getLogger(__name__)
+
+_LONGEST_GAP_S = 1.0  # between two poses, before scans in between are reported
 
 
 def interpolate_poses(
@@ -21,3 +29,26 @@ def interpolate_poses(
     share = (queries - timestamps[before]) / (timestamps[before + 1] - timestamps[before])
     twist = se3.log(se3.inverse(T_world[before]) @ T_world[before + 1])
     return T_world[before] @ se3.exp(share[:, None] * twist)
+
+
+def covered(
+    name: str, scans: ScanFiles, timestamps: Float[Tensor, "n"], truth_timestamps: Float[Tensor, "m"]
+) -> ScanFiles:
+    """The scans within the time of the ground truth; says how many are not, or lie in a hole of it.
+
+    Args:
+        name: of the sequence.
+        scans: its files.
+        timestamps: of the scans [s].
+        truth_timestamps: of the ground-truth poses [s], ascending, at least two.
+    """
+    inside = (timestamps >= truth_timestamps[0]) & (timestamps <= truth_timestamps[-1])
+    if not inside.all():
+        _log.warning("%s: %d scans before or after the ground truth are left out", name, int((~inside).sum()))
+    after = torch.searchsorted(truth_timestamps, timestamps).clamp(1, len(truth_timestamps) - 1)
+    in_hole = inside & (truth_timestamps[after] - truth_timestamps[after - 1] > _LONGEST_GAP_S)
+    if in_hole.any():
+        _log.warning(
+            "%s: %d scans lie in holes of the ground truth longer than %g s", name, int(in_hole.sum()), _LONGEST_GAP_S
+        )
+    return scans.select(np.flatnonzero(inside.numpy()).tolist())

@@ -10,7 +10,6 @@ as a spherical projection needs: there, and only there, every beam has the const
 Ground truth is the Segway's pose at about 100 Hz: utime, x, y, z, roll, pitch, heading; rows with NaN stand for no fix.
 """
 
-import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,13 +23,11 @@ from torch import Tensor
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.interpolation import interpolate_poses
+from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, start_at_identity
 from lidarlearn.data.scan_files import ScanFiles, list_scans, read_bytes, sequence_names, subfolders
 from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
-
-_log = logging.getLogger(__name__)
 
 _SOURCE = "http://robots.engin.umich.edu/nclt/ (velodyne and ground truth of each date)"
 POINT = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
@@ -38,7 +35,6 @@ SCALE_M = 0.005
 OFFSET_M = -100.0
 # From the files' axes (x forward, y right, z down) to ours (x forward, y left, z up).
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-_LONGEST_GAP_S = 1.0  # between two rows of ground truth, before scans in between are reported
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,7 +123,9 @@ class Nclt(DataSet):
             raise self._not_found(f"{name}/velodyne_sync/*.bin")
         ground_truth = self._ground_truth_file(name)
         truth = None if ground_truth is None else read_ground_truth(ground_truth)
-        scans = (scans if truth is None else _covered(name, scans, truth)).first(self.max_frames)
+        if truth is not None:
+            scans = covered(name, scans, _timestamps(scans), truth.timestamps)
+        scans = scans.first(self.max_frames)
         if ground_truth is not None and not len(scans):
             raise DamagedFileError(ground_truth, f"its times do not overlap with those of the scans of {name}")
         timestamps = _timestamps(scans)
@@ -197,21 +195,6 @@ def read_ground_truth(path: Path) -> StampedPoses:
     R = Rotation.from_euler("ZYX", rows[:, [6, 5, 4]]).as_matrix()
     T = as_transforms(torch.from_numpy(np.concatenate([R, rows[:, 1:4, None]], axis=2)))
     return StampedPoses(torch.from_numpy(rows[:, 0] * 1e-6), T)
-
-
-def _covered(name: str, scans: ScanFiles, truth: StampedPoses) -> ScanFiles:
-    """The scans within the time of the ground truth; says how many are not, or lie in a hole of it."""
-    times = _timestamps(scans)
-    inside = (times >= truth.timestamps[0]) & (times <= truth.timestamps[-1])
-    if not inside.all():
-        _log.warning("%s: %d scans before or after the ground truth are left out", name, int((~inside).sum()))
-    after = torch.searchsorted(truth.timestamps, times).clamp(1, len(truth.timestamps) - 1)
-    in_hole = inside & (truth.timestamps[after] - truth.timestamps[after - 1] > _LONGEST_GAP_S)
-    if in_hole.any():
-        _log.warning(
-            "%s: %d scans lie in holes of the ground truth longer than %g s", name, int(in_hole.sum()), _LONGEST_GAP_S
-        )
-    return scans.select(np.flatnonzero(inside.numpy()).tolist())
 
 
 def _timestamps(scans: ScanFiles) -> Float[Tensor, "n"]:

@@ -13,7 +13,7 @@ from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.pose_files import as_transforms, read_numbers, require_finite
 from lidarlearn.data.scan_files import ScanFiles
 
-_EARTH_RADIUS_M = 6378137.0
+EARTH_RADIUS_M = 6378137.0
 _COLUMNS = 30
 
 
@@ -40,7 +40,7 @@ def mercator(
     latitude_deg: NDArray[np.float64], longitude_deg: NDArray[np.float64], altitude: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """East, north, up [m] (n, 3) of a Mercator projection that is true to scale at the first latitude."""
-    scale = np.cos(np.radians(latitude_deg[0])) * _EARTH_RADIUS_M
+    scale = np.cos(np.radians(latitude_deg[0])) * EARTH_RADIUS_M
     north = np.log(np.tan(np.pi / 4 + np.radians(latitude_deg) / 2))
     return np.stack([scale * np.radians(longitude_deg), scale * north, altitude], axis=1)
 

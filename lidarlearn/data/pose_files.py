@@ -72,7 +72,19 @@ def read_tum_poses(path: Path) -> StampedPoses:
     Raises:
         DamagedFileError: not such a file, a quaternion of length zero, or times that do not ascend.
     """
-    rows = read_numbers(path, columns=8)
+    return stamped_poses(path, read_numbers(path, columns=8))
+
+
+def stamped_poses(path: Path, rows: NDArray[np.float64]) -> StampedPoses:
+    """Poses from rows of `time, x, y, z, qx, qy, qz, qw`.
+
+    Args:
+        path: the file that they come from.
+        rows: (n, 8) [s, m].
+
+    Raises:
+        DamagedFileError: not finite, a quaternion of length zero, or times that do not ascend.
+    """
     require_finite(path, rows)
     if (np.linalg.norm(rows[:, 4:], axis=1) < 0.5).any():
         raise DamagedFileError(path, "a quaternion that is not of length 1")

@@ -117,6 +117,62 @@ def _oxts_packet(T_world_imu: np.ndarray) -> str:
     return " ".join(f"{v:.14f}" for v in first) + " 0" * 24 + "\n"
 
 
+def write_kitti_360(root: Path, name: str = "0003", frames: int = 6, without_pose: tuple[int, ...] = ()) -> Written:
+    """KITTI-360; its GPS/IMU looks forward, right and down, its poses begin 1000 m from the origin."""
+    drive = f"2013_05_28_drive_{name}_sync"
+    velodyne, poses = root / "data_3d_raw" / drive / "velodyne_points", root / "data_poses" / drive
+    points = [random_points(i) for i in range(frames)]
+    for i, scan in enumerate(points):
+        write_float32(velodyne / "data" / f"{i:010d}.bin", scan)
+    start = datetime(2013, 5, 28, 8, 46, 2)
+    (velodyne / "timestamps.txt").write_text("".join(_stamp(start, 0.1 * i) + "\n" for i in range(frames)))
+    T_imu_lidar = np.diag([1.0, -1.0, -1.0, 1.0])
+    T_imu_lidar[:3, 3] = 0.8, 0.3, -0.9
+    T_imu_camera = T_imu_lidar @ np.linalg.inv(T_CAMERA_LIDAR)
+    (root / "calibration").mkdir()
+    row = kitti_rows(T_imu_camera[None])
+    (root / "calibration" / "calib_cam_to_pose.txt").write_text(f"image_00: {row}image_01: {row}")
+    (root / "calibration" / "calib_cam_to_velo.txt").write_text(kitti_rows(np.linalg.inv(T_CAMERA_LIDAR)[None]))
+    T_world_imu = curve(frames) @ np.linalg.inv(T_imu_lidar)
+    T_world_imu[:, :3, 3] += 1000
+    poses.mkdir(parents=True)
+    lines = kitti_rows(T_world_imu).splitlines()
+    rows = [f"{i} {line}\n" for i, line in enumerate(lines) if i not in without_pose]
+    (poses / "poses.txt").write_text("".join(rows))
+    return Written(points, curve(frames))
+
+
+def write_newer_college(root: Path, name: str = "01_short_experiment", frames: int = 4) -> Written:
+    """Newer College; of each scan's 1024 x 64 places every 300th holds a return."""
+    scans, truth = root / name / "raw_format" / "ouster_scan", root / name / "ground_truth"
+    scans.mkdir(parents=True)
+    truth.mkdir()
+    places, points = np.arange(0, 1024 * 64, 300), []
+    start_ns = 1583836591_950_000_000  # the second changes on the way, and nanoseconds lose digits
+    header = (
+        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1024\nHEIGHT 64\n"
+        "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 65536\nDATA binary\n"
+    )
+    for i in range(frames):
+        grid = np.zeros((1024 * 64, 3), dtype="<f4")
+        grid[places] = random_points(i, len(places))
+        points.append(grid[places])
+        seconds, nanoseconds = divmod(start_ns + 100_000_000 * i, 10**9)
+        (scans / f"cloud_{seconds}_{nanoseconds}.pcd").write_bytes(header.encode() + grid.tobytes())
+    half = expm(np.real(logm(curve(2)[1])) / 2)
+    T_camera_lidar = np.eye(4)
+    T_camera_lidar[:3, :3] = Rotation.from_quat([0, 0, 0.924, 0.383]).as_matrix()
+    T_camera_lidar[:3, 3] = -0.084, -0.025, 0.05
+    lines = ["#sec,nsec,x,y,z,qx,qy,qz,qw"]
+    for k in range(2 * frames + 2):  # every 50 ms from 50 ms before the first middle of a sweep
+        T = np.linalg.matrix_power(half, k) @ np.linalg.inv(T_camera_lidar)
+        numbers = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+        seconds, nanoseconds = divmod(start_ns + 50_000_000 * k, 10**9)
+        lines.append(f"{seconds},{nanoseconds}," + ",".join(f"{v:.12f}" for v in numbers))
+    (truth / "registered_poses.csv").write_text("\n".join(lines) + "\n")
+    return Written(points, curve(frames))
+
+
 def write_nclt(root: Path, date: str = "2012-01-08", frames: int = 5, sensor_height_m: float = 1.03) -> Written:
     """NCLT; ground truth every 10 ms inside the date's folder, its first row NaN as in the genuine files."""
     folder = root / date / "velodyne_sync"

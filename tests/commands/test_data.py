@@ -3,14 +3,16 @@ import sys
 
 import pytest
 
-from lidarlearn.commands.check_data import compose_data_set, data_groups, main
+from lidarlearn.commands.data import compose_data_set, data_groups, main
 from lidarlearn.data.sequence import DataSet
 from tests.data.writers import (
     write_float32,
     write_ford_campus,
+    write_kitti_360,
     write_kitti_odometry,
     write_kitti_raw,
     write_nclt,
+    write_newer_college,
 )
 
 DATA_ON_DISK = [name for name in data_groups() if not name.startswith("simulated")]
@@ -68,6 +70,8 @@ def test_sequence_numbers_from_the_command_line():
     [
         ("kitti_00-08", write_kitti_odometry, "04"),
         ("kitti_raw", write_kitti_raw, "2011_09_26_drive_0009"),
+        ("kitti_360", write_kitti_360, "0003"),
+        ("newer_college", write_newer_college, "01_short_experiment"),
         ("nclt", write_nclt, "2012-01-08"),
         ("ford_campus", write_ford_campus, "IJRR-Dataset-1"),
         ("folder", lambda root: write_float32(root / "drive" / "0.bin", [[1, 2, 3]]), "drive"),
@@ -77,8 +81,8 @@ def test_a_whole_copy_is_usable_and_a_partial_one_is_described(tmp_path, capsys,
     write(tmp_path)
     code, printed = run(capsys, "check", f"data={name}", f"data.root={tmp_path}", *only(sequence))
     assert code == 0 and sequence in printed and "usable as configured" in printed
-    code, printed = run(capsys, "check", f"data={name}", f"data.root={tmp_path}", *only("99"))
-    assert code == 1 and "missing 99" in printed and "NOT usable" in printed
+    code, printed = run(capsys, "check", f"data={name}", f"data.root={tmp_path}", *only("9999"))
+    assert code == 1 and "missing 9999" in printed and "NOT usable" in printed
     assert f"({sequence})" in printed  # what there is instead
 
 

@@ -1,0 +1,64 @@
+"""A plain folder of scans."""
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+from pypcd4 import PointCloud
+
+from lidarlearn.data.beam_correction import raise_beams
+from lidarlearn.data.cloud_files import SUFFIXES
+from lidarlearn.data.export.drives import PERIOD_S, scans_of, timestamps_of
+from lidarlearn.data.export.kitti import matrix_row
+from lidarlearn.data.folder import Folder
+from lidarlearn.data.sequence import Sequence
+from lidarlearn.errors import UserError
+
+
+def write_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd") -> None:
+    """Scans, times.txt and, where the drive has ground truth, poses.txt with the LiDAR's own poses.
+
+    .pcd and .ply hold intensities and point times [s from the first point on] where the drive has them, .bin and .npy
+    x, y, z, intensity.
+
+    Args:
+        drive: what is written.
+        target: the folder of folders.
+        name: of the folder.
+        suffix: .bin, .npy, .pcd or .ply.
+    """
+    if suffix not in SUFFIXES:
+        raise UserError(f"scans cannot be written as {suffix}.\n  change: suffix={'|'.join(SUFFIXES)}")
+    folder = target.root / name
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, scan in enumerate(scans_of(drive, name)):
+        x, y, z = raise_beams(scan.points, -target.beam_correction_deg).numpy().T
+        fields: dict[str, NDArray[np.float32]] = {"x": x, "y": y, "z": z}
+        if scan.intensities is not None:
+            fields["intensity"] = scan.intensities.numpy() * np.float32(target.max_intensity or 1.0)
+        if scan.times is not None:
+            fields["t"] = ((scan.times - scan.times.min()) * PERIOD_S).numpy()
+        _write(folder / f"{index:06d}{suffix}", fields, target.bin_columns)
+    (folder / "times.txt").write_text("".join(f"{time:.9f}\n" for time in timestamps_of(drive).tolist()))
+    if drive.T_world_lidar is not None:
+        (folder / "poses.txt").write_text("".join(f"{matrix_row(T)}\n" for T in drive.T_world_lidar))
+
+
+def _write(path: Path, fields: dict[str, NDArray[np.float32]], bin_columns: int) -> None:
+    match path.suffix:
+        case ".pcd":
+            cloud = PointCloud.from_points(list(fields.values()), tuple(fields), (np.float32,) * len(fields))
+            cloud.save(path)
+        case ".ply":
+            points = np.stack([fields.pop(axis) for axis in "xyz"], axis=1)
+            meshio.Mesh(points, [], point_data=dict(fields)).write(path, file_format="ply", binary=True)
+        case _:
+            rows = np.zeros((len(fields["x"]), bin_columns if path.suffix == ".bin" else 4), dtype="<f4")
+            for column, field in enumerate(("x", "y", "z", "intensity")):
+                if field in fields:
+                    rows[:, column] = fields[field]
+            if path.suffix == ".bin":
+                path.write_bytes(rows.tobytes())
+            else:
+                np.save(path, rows)

@@ -1,0 +1,217 @@
+"""KITTI-360: nine drives through Karlsruhe's suburbs with an HDL-64, not motion compensated.
+
+On disk: `data_3d_raw/2013_05_28_drive_NNNN_sync/velodyne_points/{data/%010d.bin, timestamps.txt}`,
+`data_poses/2013_05_28_drive_NNNN_sync/poses.txt` and `calibration/{calib_cam_to_pose.txt, calib_cam_to_velo.txt}`.
+Scans are float32 x, y, z, reflectance in the LiDAR's frame. A row of poses.txt is the number of a scan and the 3x4
+pose of the GPS/IMU when the laser faced forward; scans without one (the car stood still) have theirs interpolated in
+time. The laser turns as in KITTI raw, and point times follow likewise.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.data import layout
+from lidarlearn.data.beam_correction import raise_beams
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.interpolation import covered, interpolate_poses
+from lidarlearn.data.kitti_raw import sweep_times
+from lidarlearn.data.oxts import read_timestamps
+from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, require_finite, start_at_identity
+from lidarlearn.data.scan_files import ScanFiles, list_scans, read_float32_rows, sequence_names, subfolders
+from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.geometry.projection import SphericalProjection
+
+_SOURCE = "https://www.cvlibs.net/datasets/kitti-360/ (raw Velodyne scans, calibrations, vehicle poses)"
+_PREFIX, _SUFFIX = "2013_05_28_drive_", "_sync"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Kitti360Sequence(Sequence):
+    """A drive of KITTI-360.
+
+    Args:
+        name: four digits.
+        scans: its files.
+        T_world_lidar: from GPS, IMU and registration; None where there are no poses.
+        timestamps: when the laser faced forward [s], of the day's clock.
+        beam_correction_deg: angle by which every beam is raised.
+    """
+
+    name: str
+    scans: ScanFiles
+    T_world_lidar: Float[Tensor, "n 4 4"] | None
+    timestamps: Float[Tensor, "n"] | None
+    beam_correction_deg: float
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan, with point times relative to the middle of the sweep."""
+        rows = read_float32_rows(self.scans.path(index), columns=4)
+        points = raise_beams(rows[:, :3], self.beam_correction_deg)
+        return Scan(points, times=sweep_times(points), intensities=rows[:, 3].clamp(0, 1))
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the files and the beam correction."""
+        return self.scans.fingerprint("Kitti360", beam_correction_deg=self.beam_correction_deg)
+
+
+class Kitti360(DataSet):
+    """KITTI-360.
+
+    Args:
+        root: the folder that holds data_3d_raw, data_poses and calibration.
+        projection: the image of the HDL-64.
+        train_sequences: four digits each, e.g. 0003.
+        val_sequences: likewise.
+        test_sequences: likewise.
+        max_frames: keep only the first scans of each sequence; None keeps all.
+        deskew: whether odometries compensate the motion within a scan.
+        beam_correction_deg: angle by which every beam is raised.
+    """
+
+    title = "KITTI-360"
+
+    def __init__(
+        self,
+        root: str | Path,
+        projection: SphericalProjection,
+        train_sequences: Iterable[str | int],
+        val_sequences: Iterable[str | int],
+        test_sequences: Iterable[str | int],
+        max_frames: int | None = None,
+        deskew: bool = True,
+        beam_correction_deg: float | int = 0.0,
+    ) -> None:
+        self.root = Path(root)
+        self.projection = projection
+        self.train_sequences = sequence_names(train_sequences, digits=4)
+        self.val_sequences = sequence_names(val_sequences, digits=4)
+        self.test_sequences = sequence_names(test_sequences, digits=4)
+        self.max_frames = max_frames
+        self.deskew = deskew
+        self.beam_correction_deg = float(beam_correction_deg)
+
+    def sequence(self, name: str) -> Kitti360Sequence:
+        """Open a drive; scans before its first and after its last pose are left out."""
+        scans = self._scans(name)
+        if not len(scans):
+            raise self._not_found(f"data_3d_raw/{drive_folder(name)}/velodyne_points/data/*.bin")
+        stamps = self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "timestamps.txt"
+        if not stamps.is_file():
+            raise self._not_found(str(stamps.relative_to(self.root)))
+        truth = self._poses(name, stamps)
+        if truth is not None:
+            scans = covered(name, scans, read_timestamps(stamps, scans.numbers), truth.timestamps)
+        scans = scans.first(self.max_frames)
+        if not len(scans):
+            raise DamagedFileError(self._poses_file(name), f"its poses belong to none of the scans of {name}")
+        timestamps = read_timestamps(stamps, scans.numbers)
+        T_world_lidar = None
+        if truth is not None:
+            T_world_lidar = start_at_identity(
+                interpolate_poses(truth.timestamps, truth.T_world_body, timestamps) @ self._calibration()
+            )
+        return Kitti360Sequence(
+            name=name,
+            scans=scans,
+            T_world_lidar=T_world_lidar,
+            timestamps=timestamps,
+            beam_correction_deg=self.beam_correction_deg,
+        )
+
+    def check(self) -> LayoutReport:
+        """Describe this copy by names, sizes and the lengths of text files."""
+        report = LayoutReport()
+        if layout.describe_root(report, self.root, _is_root, "folder data_3d_raw with drives", _SOURCE):
+            drives = [folder.name for folder in subfolders(self.root / "data_3d_raw")]
+            names = [name.removeprefix(_PREFIX).removesuffix(_SUFFIX) for name in drives if name.startswith(_PREFIX)]
+            there = {name: self._scans(name) for name in names}
+            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
+            for name in configured:
+                self._check_sequence(report, name)
+            for file in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt"):
+                if not (self.root / "calibration" / file).is_file():
+                    report.missing("calibration", f"no calibration/{file}")
+            layout.describe_unconfigured(report, there, configured)
+            layout.suggest_sequences(report, there)
+        return report
+
+    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+        folder = self.root / "data_3d_raw" / drive_folder(name)
+        if not folder.is_dir():
+            report.missing(name, f"no folder {folder.relative_to(self.root)}")
+            return
+        scans = self._scans(name)
+        layout.describe_scans(report, name, scans, bytes_per_point=16)
+        rows_needed = max(scans.numbers, default=-1) + 1
+        stamps = folder / "velodyne_points" / "timestamps.txt"
+        layout.describe_rows(report, name, stamps, "times", rows_needed, needed=True)
+        poses = self._poses_file(name)
+        if poses.is_file():
+            report.found(name, f"{layout.count_rows(poses)} poses")
+        else:
+            note = report.missing if name in self.test_sequences else report.odd
+            note(name, f"no ground truth: no {poses.relative_to(self.root)}")
+
+    def _scans(self, name: str) -> ScanFiles:
+        return list_scans(self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "data", (".bin",))
+
+    def _poses_file(self, name: str) -> Path:
+        return self.root / "data_poses" / drive_folder(name) / "poses.txt"
+
+    def _poses(self, name: str, stamps: Path) -> StampedPoses | None:
+        """Poses of the GPS/IMU with the times of the scans that they belong to."""
+        path = self._poses_file(name)
+        if not path.is_file():
+            return None
+        rows = read_numbers(path, columns=13)
+        require_finite(path, rows)
+        if len(rows) < 2 or (np.diff(rows[:, 0]) <= 0).any():
+            raise DamagedFileError(path, "fewer than two poses, or scan numbers that do not ascend")
+        times = read_timestamps(stamps, rows[:, 0].astype(int).tolist())
+        return StampedPoses(times, as_transforms(torch.from_numpy(rows[:, 1:]).reshape(-1, 3, 4)))
+
+    def _calibration(self) -> Float[Tensor, "4 4"]:
+        """T_imu_lidar."""
+        paths = [self.root / "calibration" / name for name in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt")]
+        for path in paths:
+            if not path.is_file():
+                raise self._not_found(str(path.relative_to(self.root)))
+        T_imu_camera = _transform(paths[0], "image_00:")
+        T_lidar_camera = _transform(paths[1], "")
+        return T_imu_camera @ torch.linalg.inv(T_lidar_camera)
+
+    def _not_found(self, missing: str) -> DataSetNotFoundError:
+        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
+
+
+def drive_folder(name: str) -> str:
+    """Folder of a drive: 0003 becomes 2013_05_28_drive_0003_sync."""
+    return f"{_PREFIX}{name}{_SUFFIX}"
+
+
+def _transform(path: Path, label: str) -> Float[Tensor, "4 4"]:
+    """The transform on the line that begins with a label.
+
+    Raises:
+        DamagedFileError: no such line, or not twelve numbers.
+    """
+    lines = [line.removeprefix(label) for line in path.read_text().splitlines() if line.startswith(label)]
+    try:
+        numbers = torch.tensor([float(value) for value in lines[0].split()], dtype=torch.float64)
+        return as_transforms(numbers.reshape(3, 4))
+    except (IndexError, ValueError, RuntimeError) as error:
+        raise DamagedFileError(path, f"no line {label!r} with twelve numbers") from error
+
+
+def _is_root(path: Path) -> bool:
+    return (path / "data_3d_raw").is_dir()

@@ -1,0 +1,208 @@
+"""Newer College (2020): walks through an Oxford college with a hand-held Ouster OS1-64, not motion compensated.
+
+On disk: `NAME/raw_format/ouster_scan/cloud_<s>_<ns>.pcd` and `NAME/ground_truth/registered_poses.csv`. A scan's name is
+the time of its first column. A .pcd holds 1024 columns of 64 points each, those without a return at the origin, so a
+point's place in the file gives its time. Poses (`sec,nsec,x,y,z,qx,qy,qz,qw`) are those of the left camera at about
+10 Hz, from registration to a survey-grade map; we interpolate them at the middle of each sweep.
+"""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from lidarlearn.data import layout
+from lidarlearn.data.beam_correction import raise_beams
+from lidarlearn.data.cloud_files import read_cloud
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.interpolation import covered, interpolate_poses
+from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, stamped_poses, start_at_identity
+from lidarlearn.data.scan_files import ScanFiles, list_scans, sequence_names, subfolders
+from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.geometry.projection import SphericalProjection
+
+_SOURCE = "https://ori-drs.github.io/newer-college-dataset/ (2020 release: ouster_scan and ground_truth of a sequence)"
+BEAMS, COLUMNS = 64, 1024
+PERIOD_S = 0.1
+
+
+def _left_camera_to_lidar() -> Float[Tensor, "4 4"]:
+    """T_camera_lidar. Source: the data set's calibration, as in pyLiDAR-SLAM and KISS-ICP."""
+    R = Rotation.from_quat([0.0, 0.0, 0.924, 0.383]).as_matrix()
+    return as_transforms(torch.from_numpy(np.column_stack([R, [-0.084, -0.025, 0.050]])))
+
+
+T_CAMERA_LIDAR = _left_camera_to_lidar()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NewerCollegeSequence(Sequence):
+    """A walk of Newer College.
+
+    Args:
+        name: e.g. 01_short_experiment.
+        scans: its files.
+        T_world_lidar: ground truth at the middle of each sweep; None where there is none.
+        timestamps: middle of each sweep [s].
+        beam_correction_deg: angle by which every beam is raised.
+    """
+
+    name: str
+    scans: ScanFiles
+    T_world_lidar: Float[Tensor, "n 4 4"] | None
+    timestamps: Float[Tensor, "n"] | None
+    beam_correction_deg: float
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan, with point times relative to the middle of the sweep; none where columns are missing."""
+        cloud = read_cloud(self.scans.path(index))
+        whole = cloud.file_rows == BEAMS * COLUMNS
+        times = (cloud.rows // BEAMS).float() / COLUMNS - 0.5 if whole else None
+        return Scan(raise_beams(cloud.points, self.beam_correction_deg), times=times)
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the files and the beam correction."""
+        return self.scans.fingerprint("NewerCollege", beam_correction_deg=self.beam_correction_deg)
+
+
+class NewerCollege(DataSet):
+    """Newer College (2020).
+
+    Args:
+        root: the folder that holds the walks, e.g. 01_short_experiment.
+        projection: the image of the OS1-64.
+        train_sequences: names of walks.
+        val_sequences: likewise.
+        test_sequences: likewise.
+        max_frames: keep only the first scans of each sequence; None keeps all.
+        deskew: whether odometries compensate the motion within a scan.
+        beam_correction_deg: angle by which every beam is raised.
+    """
+
+    title = "Newer College"
+
+    def __init__(
+        self,
+        root: str | Path,
+        projection: SphericalProjection,
+        train_sequences: Iterable[str | int],
+        val_sequences: Iterable[str | int],
+        test_sequences: Iterable[str | int],
+        max_frames: int | None = None,
+        deskew: bool = True,
+        beam_correction_deg: float | int = 0.0,
+    ) -> None:
+        self.root = Path(root)
+        self.projection = projection
+        self.train_sequences = sequence_names(train_sequences)
+        self.val_sequences = sequence_names(val_sequences)
+        self.test_sequences = sequence_names(test_sequences)
+        self.max_frames = max_frames
+        self.deskew = deskew
+        self.beam_correction_deg = float(beam_correction_deg)
+
+    def sequence(self, name: str) -> NewerCollegeSequence:
+        """Open a walk; scans before and after its ground truth are left out."""
+        scans = list_scans(_scan_folder(self.root / name), (".pcd",))
+        if not len(scans):
+            raise self._not_found(f"{name}/raw_format/ouster_scan/cloud_*.pcd")
+        truth_file = self._truth_file(name)
+        truth = read_registered_poses(truth_file) if truth_file.is_file() else None
+        if truth is not None:
+            scans = covered(name, scans, _middles(scans), truth.timestamps)
+        scans = scans.first(self.max_frames)
+        if not len(scans):
+            raise DamagedFileError(truth_file, f"its times do not overlap with those of the scans of {name}")
+        timestamps = _middles(scans)
+        T_world_lidar = None
+        if truth is not None:
+            T_world_camera = interpolate_poses(truth.timestamps, truth.T_world_body, timestamps)
+            T_world_lidar = start_at_identity(T_world_camera @ T_CAMERA_LIDAR)
+        return NewerCollegeSequence(
+            name=name,
+            scans=scans,
+            T_world_lidar=T_world_lidar,
+            timestamps=timestamps,
+            beam_correction_deg=self.beam_correction_deg,
+        )
+
+    def check(self) -> LayoutReport:
+        """Describe this copy by names and sizes."""
+        report = LayoutReport()
+        marker = "folder like 01_short_experiment with raw_format/ouster_scan in it"
+        if layout.describe_root(report, self.root, _is_root, marker, _SOURCE):
+            walks = [folder for folder in subfolders(self.root) if _scan_folder(folder).is_dir()]
+            there = {folder.name: list_scans(_scan_folder(folder), (".pcd",)) for folder in walks}
+            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
+            for name in configured:
+                self._check_sequence(report, name)
+            layout.describe_unconfigured(report, there, configured)
+            layout.suggest_sequences(report, there)
+        return report
+
+    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+        if not (self.root / name).is_dir():
+            report.missing(name, f"no folder {name}")
+            return
+        scans = list_scans(_scan_folder(self.root / name), (".pcd",))
+        layout.describe_scans(report, name, scans, bytes_per_point=None, numbered=False)
+        unnamed = [file for file in scans.names if not _NAME.match(file)]
+        if unnamed:
+            report.missing(name, f"{len(unnamed)} files not named cloud_<s>_<ns>.pcd, the first is {unnamed[0]}")
+        note = report.missing if name in self.test_sequences else report.odd
+        truth = self._truth_file(name)
+        if not truth.is_file():
+            note(name, f"no ground truth: no {truth.relative_to(self.root)}")
+        elif truth.stat().st_size == 0:
+            report.missing(name, f"empty ground truth: {truth}")
+        else:
+            report.found(name, f"ground truth in {truth.relative_to(self.root)}")
+
+    def _truth_file(self, name: str) -> Path:
+        return self.root / name / "ground_truth" / "registered_poses.csv"
+
+    def _not_found(self, missing: str) -> DataSetNotFoundError:
+        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
+
+
+def read_registered_poses(path: Path) -> StampedPoses:
+    """The left camera's poses from rows of `sec, nsec, x, y, z, qx, qy, qz, qw` [s, ns, m].
+
+    Raises:
+        DamagedFileError: not such a file, fewer than two rows, or times that do not ascend.
+    """
+    rows = read_numbers(path, columns=9, delimiter=",")
+    if len(rows) < 2:
+        raise DamagedFileError(path, f"{len(rows)} rows, at least two are needed")
+    return stamped_poses(path, np.column_stack([rows[:, 0] + 1e-9 * rows[:, 1], rows[:, 2:]]))
+
+
+_NAME = re.compile(r"cloud_(\d+)_(\d+)\.pcd$")
+
+
+def _middles(scans: ScanFiles) -> Float[Tensor, "n"]:
+    """Time of the middle of each sweep [s], from the files' names."""
+    matches = [_NAME.match(name) for name in scans.names]
+    if None in matches:
+        path = scans.path(matches.index(None))
+        raise DamagedFileError(path, "not named cloud_<s>_<ns>.pcd, so its time is unknown", "rename or remove it")
+    starts = [int(match[1]) + 1e-9 * int(match[2]) for match in matches if match is not None]
+    return torch.tensor(starts, dtype=torch.float64) + PERIOD_S / 2
+
+
+def _scan_folder(walk: Path) -> Path:
+    return walk / "raw_format" / "ouster_scan"
+
+
+def _is_root(path: Path) -> bool:
+    return any(_scan_folder(folder).is_dir() for folder in subfolders(path))

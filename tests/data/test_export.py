@@ -1,0 +1,142 @@
+"""Simulated drives written in each native format, read back by its reader, and driven by an odometry."""
+
+import numpy as np
+import pytest
+import torch
+
+from lidarlearn.commands.data import compose_data_set, main
+from lidarlearn.data.export.formats import export
+from lidarlearn.errors import UserError
+from lidarlearn.geometry import se3
+from lidarlearn.simulation.drive import Drive
+from lidarlearn.simulation.sensors import Sensor, hdl32_inverted, hdl64
+from tests.odometry.odometries import build, motion_errors, poses
+
+FRAMES = 5
+OS1_GEN1 = Sensor("OS1-64", tuple(torch.linspace(16.6, -16.6, 64).tolist()), 1024, range_noise=0.02)
+# format, sequence there, sensor, distorted by motion, largest error of a coordinate [m]
+FORMATS = {
+    "kitti_00-08": ("03", hdl64(512), False, 2e-5),
+    "kitti_raw": ("2011_09_26_drive_0009", hdl64(512), True, 2e-5),
+    "kitti_360": ("0003", hdl64(512), True, 1e-6),
+    "ford_campus": ("IJRR-Dataset-1", hdl64(512), False, 1e-6),
+    "nclt": ("2012-01-08", hdl32_inverted(512), False, 0.003),
+    "newer_college": ("01_short_experiment", OS1_GEN1, True, 1e-6),
+    "folder": ("drive", hdl64(512), True, 1e-6),
+}
+TIME_TOLERANCE = 3e-3  # of a sweep: azimuths shift by a fraction of a column from scan to scan
+
+
+def simulated(sensor, distorted, frames=FRAMES):
+    return Drive("urban", seed=4, frames=frames, speed=9.0, sensor=sensor, motion_distortion=distorted)
+
+
+def target_of(name, root):
+    return compose_data_set([f"data={name}", f"data.root={root}"])
+
+
+def by_place(points, *others):
+    """Points, and what belongs to them, in an order that does not depend on that of the file."""
+    order = torch.from_numpy(np.lexsort(points.numpy().T))
+    return [points[order], *(other[order] for other in others)]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_round_trip(name, tmp_path):
+    sequence, sensor, distorted, tolerance = FORMATS[name]
+    drive = simulated(sensor, distorted)
+    target = target_of(name, tmp_path)
+    export(drive, target, sequence)
+    read = target_of(name, tmp_path).sequence(sequence)
+    assert len(read) == FRAMES
+    for scan, original in zip(read, drive, strict=True):
+        points, times = original.points, original.times
+        if name == "ford_campus":
+            points = points[points.norm(dim=1) >= 8.0]
+        assert len(scan.points) == len(points)
+        if name == "newer_college":  # column after column
+            points, times = by_place(points, times)
+            got, got_times = by_place(scan.points, scan.times)
+        else:
+            got, got_times = scan.points, scan.times
+        assert (got - points).abs().max() <= tolerance
+        assert (got_times is None) == (times is None)
+        assert times is None or (got_times - times).abs().max() <= TIME_TOLERANCE
+    torch.testing.assert_close(read.T_world_lidar, drive.T_world_lidar, rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        read.timestamps - read.timestamps[0], drive.timestamps - drive.timestamps[0], rtol=0, atol=1e-6
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_odometry_makes_the_same_error_on_the_copy(name, tmp_path):
+    sequence, sensor, distorted, _ = FORMATS[name]
+    drive = simulated(sensor, distorted, frames=15)
+    target = target_of(name, tmp_path)
+    export(drive, target, sequence)
+    read = target_of(name, tmp_path).sequence(sequence)
+    errors = []
+    for source in (drive, read):
+        odometry = build("cv+kd_f2m")
+        frames = [odometry.register_scan(scan.points, scan.times) for scan in source]
+        errors.append(float(motion_errors(poses(frames), drive.T_world_lidar)[0].mean()))
+    assert errors[0] < 0.02
+    # one leaves out what is close to the car, one rounds to 5 mm
+    assert errors[1] == pytest.approx(errors[0], abs={"ford_campus": 0.005, "nclt": 0.003}.get(name, 0.001))
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".npy", ".pcd", ".ply"])
+def test_a_folder_in_any_kind_of_file(suffix, tmp_path):
+    drive = simulated(hdl64(128), True, frames=2)
+    export(drive, target_of("folder", tmp_path), "drive", suffix=suffix)
+    read = target_of("folder", tmp_path).sequence("drive")
+    assert torch.equal(read.scan(1).points, drive.scan(1).points)
+    assert (read.scan(1).times is not None) == (suffix in (".pcd", ".ply"))
+
+
+def test_the_car_goes_where_its_packets_say(tmp_path):
+    drive = simulated(hdl64(64), True)
+    export(drive, target_of("kitti_raw", tmp_path), "2011_09_26_drive_0009")
+    folder = tmp_path / "2011_09_26" / "2011_09_26_drive_0009_sync" / "oxts" / "data"
+    packets = [[float(v) for v in path.read_text().split()] for path in sorted(folder.iterdir())]
+    assert len(packets) == FRAMES and all(len(packet) == 30 for packet in packets)
+    assert [packet[8] for packet in packets] == pytest.approx([9.0] * FRAMES, abs=0.2)  # forward [m/s]
+
+
+@pytest.mark.parametrize(
+    ("name", "distorted", "said"),
+    [
+        ("kitti_00-08", True, "motion_distortion=false"),
+        ("nclt", True, "motion_distortion=false"),
+        ("ford_campus", True, "motion_distortion=false"),
+        ("kitti_raw", False, "motion_distortion=true"),
+        ("kitti_360", False, "motion_distortion=true"),
+        ("newer_college", False, "motion_distortion=true"),
+        ("simulated_urban", False, "cannot be written"),
+    ],
+)
+def test_what_a_format_cannot_hold_is_said(name, distorted, said, tmp_path):
+    with pytest.raises(UserError, match=said):
+        export(simulated(hdl64(64), distorted, frames=2), target_of(name, tmp_path), "2012-01-08_drive_1")
+
+
+def test_the_command_writes_all_sequences_and_tells_how_to_train_on_them(tmp_path, capsys):
+    arguments = [
+        "export",
+        "data=simulated_urban",
+        f"data.root={tmp_path}/simulated",
+        "data.frames=2",
+        "data.sensor.columns=64",
+        "to=kitti_00-08",
+        f"to.root={tmp_path}/kitti",
+    ]
+    with pytest.raises(SystemExit) as exited:
+        main(arguments)
+    printed = capsys.readouterr().out
+    assert exited.value.code == 0
+    assert "urban_06 (val) -> 07: 2 scans" in printed and "urban_07 (test) -> 09" in printed
+    suggested = [word.strip("'") for word in printed.split("train.py ")[1].split()]
+    data = compose_data_set(suggested)
+    assert len(data.train_sequences) == 6 and data.check().usable
+    assert torch.equal(data.sequence("09").T_world_lidar[0], se3.identity())
