@@ -1,4 +1,4 @@
-"""`python -m lidarlearn.data check|export ...`: describe a copy of a data set, or write one in the format of another."""
+"""`python -m lidarlearn.data check|export ...`: describe a copy of a data set, or write it in the format of another."""
 
 import sys
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _STYLES = {"found": "green", "odd": "yellow", "missing": "bold red"}
 _USAGE = """usage:
   python -m lidarlearn.data check data=<data set> [data.root=/path/to/your/copy] [data.<setting>=...]
       says what is there, what is missing and what looks odd
-  python -m lidarlearn.data export data=<data set> to=<data set> to.root=/where/to [data.<setting>=...] [to.<setting>=...]
+  python -m lidarlearn.data export data=<data set> to=<data set> to.root=DIR [data.<setting>=...] [to.<setting>=...]
       writes the sequences of the one in the native format of the other; to=folder takes suffix=.bin|.npy|.pcd|.ply"""
 _ROLES = ("train", "val", "test")
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.utils.data import ConcatDataset, DataLoader
 
 from lidarlearn.data import cache
+from lidarlearn.data.augmentation import Augmentation
 from lidarlearn.data.pairs import Pair, ScanPairs
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
@@ -29,7 +30,7 @@ class OdometryDataModule(LightningDataModule):
         cache_root: folder of the vertex maps' caches.
         height: rows of the network's image [px]; None takes the data set's.
         width: its columns [px]; None takes the data set's.
-        mirror: mirror every other training pair, by chance; see `ScanPairs`.
+        augmentation: what is done to training pairs by chance; None for nothing.
         preparation_workers: processes that project scans into the cache; None takes one per core.
     """
 
@@ -41,7 +42,7 @@ class OdometryDataModule(LightningDataModule):
         cache_root: str = "datasets/cache",
         height: int | None = None,
         width: int | None = None,
-        mirror: bool = True,
+        augmentation: Augmentation | None = None,
         preparation_workers: int | None = None,
     ) -> None:
         super().__init__()
@@ -49,7 +50,7 @@ class OdometryDataModule(LightningDataModule):
         self.batch_size = batch_size
         self.num_workers = num_workers
         self.cache_root = Path(cache_root).expanduser()
-        self.mirror = mirror
+        self.augmentation = augmentation
         self.preparation_workers = _usable_cores() if preparation_workers is None else preparation_workers
         self.projection: SphericalProjection = replace(
             data.projection, height=height or data.projection.height, width=width or data.projection.width
@@ -72,7 +73,7 @@ class OdometryDataModule(LightningDataModule):
         train = [self.data.sequence(name) for name in self.data.train_sequences]
         # One sequence without ground truth and the batches of all go without: a batch holds the same for every pair.
         labelled = all(sequence.T_world_lidar is not None for sequence in train)
-        pairs = [self._pairs(s, labelled, self.mirror) for s in train]
+        pairs = [self._pairs(s, labelled, self.augmentation) for s in train]
         if not sum(map(len, pairs)):
             raise UserError(
                 f"{self.data.title}: no pair of scans to train on in sequences {list(self.data.train_sequences)}"
@@ -80,7 +81,7 @@ class OdometryDataModule(LightningDataModule):
             )
         self._train_pairs: ConcatDataset[Pair] = ConcatDataset(pairs)
         self.val_sequences = [self.data.sequence(name) for name in self.data.val_sequences]
-        self._val_pairs = [self._pairs(s, s.T_world_lidar is not None, mirror=False) for s in self.val_sequences]
+        self._val_pairs = [self._pairs(s, s.T_world_lidar is not None) for s in self.val_sequences]
 
     def train_dataloader(self) -> DataLoader[Pair]:
         """Shuffled pairs of all training sequences; a last, smaller batch is left out."""
@@ -95,8 +96,10 @@ class OdometryDataModule(LightningDataModule):
         maps: dict[str, Tensor] = {key: cache.decode(batch[key]) for key in ("reference", "target")}
         return {**batch, **maps}
 
-    def _pairs(self, sequence: Sequence, labelled: bool, mirror: bool) -> ScanPairs:
-        return ScanPairs(self._vertex_maps(sequence), sequence.T_world_lidar if labelled else None, mirror)
+    def _pairs(self, sequence: Sequence, labelled: bool, augmentation: Augmentation | None = None) -> ScanPairs:
+        step = None if augmentation is None else augmentation.step
+        T_world_lidar = sequence.T_world_lidar if labelled else None
+        return ScanPairs(self._vertex_maps(sequence), T_world_lidar, augmentation, step)
 
     def _vertex_maps(self, sequence: Sequence) -> cache.VertexMaps:
         return cache.cached_vertex_maps(sequence, self.projection, self.cache_root, self.preparation_workers)

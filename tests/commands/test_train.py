@@ -20,7 +20,7 @@ TRAIN = Path(__file__).parents[2] / "train.py"
 SMALL = (
     "data.frames=18", "data.train_sequences=[urban_00,urban_01]", "data.val_sequences=[urban_02]", "data.workers=0",
     "device=cpu", "datamodule.preparation_workers=0", "datamodule.batch_size=4", "datamodule.height=16",
-    "datamodule.width=90", "datamodule.mirror=false", "~callbacks.images",
+    "datamodule.width=90", "datamodule.augmentation.mirror=false", "~callbacks.images",
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from tests.box_world import SMALL, BoxDrives
 
 
 def make(tmp_path, drives=None, **settings):
-    settings = {"batch_size": 4, "num_workers": 0, "preparation_workers": 0, "mirror": False} | settings
+    settings = {"batch_size": 4, "num_workers": 0, "preparation_workers": 0} | settings
     module = OdometryDataModule(drives or BoxDrives(frames=9), cache_root=str(tmp_path), **settings)
     module.prepare_data()
     module.setup()

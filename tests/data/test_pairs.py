@@ -1,15 +1,13 @@
-"""Pairs of scans and their mirror images."""
-
-from collections import Counter
+"""Pairs of scans and their labels."""
 
 import numpy as np
 import pytest
 import torch
 
-from lidarlearn.data.cache import VertexMaps, decode, encode
-from lidarlearn.data.pairs import ScanPairs, mirrored
+from lidarlearn.data.cache import VertexMaps, encode
+from lidarlearn.data.pairs import ScanPairs
 from lidarlearn.geometry import se3
-from tests.box_world import SMALL, BoxSequence, cast
+from tests.box_world import SMALL, BoxSequence
 
 
 @pytest.fixture
@@ -47,31 +45,10 @@ def test_poses_that_do_not_belong_to_the_scans_are_refused(sequence, vertex_maps
         ScanPairs(vertex_maps, sequence.T_world_lidar * torch.nan)
 
 
-def test_the_mirror_image_is_what_a_mirrored_drive_would_have_seen(sequence, vertex_maps):
-    pair = ScanPairs(vertex_maps, sequence.T_world_lidar)[2]
-    image = mirrored(pair)
-    flip = torch.tensor([1.0, -1, 1])
-    for key, index in (("reference", 2), ("target", 3)):
-        seen = SMALL.vertex_map(cast(sequence.T_world_lidar[index]) * flip)
-        # Points exactly on a pixel's border may change sides.
-        same = ((decode(image[key]) - seen).abs().amax(0) < 0.01).float().mean()
-        assert same > 0.98
-    x, y, z, roll, pitch, yaw = se3.to_euler(pair["T_ref_new"])
-    expected = torch.stack([x, -y, z, -roll, pitch, -yaw])
-    torch.testing.assert_close(se3.to_euler(image["T_ref_new"]), expected)
-
-
-def test_mirroring_twice_is_no_change(sequence, vertex_maps):
-    pair = ScanPairs(vertex_maps, sequence.T_world_lidar)[1]
-    twice = mirrored(mirrored(pair))
-    for key in pair:
-        torch.testing.assert_close(twice[key], pair[key])
-
-
-def test_about_every_other_training_pair_is_mirrored(sequence, vertex_maps):
-    torch.manual_seed(0)
-    pairs = ScanPairs(vertex_maps, sequence.T_world_lidar, mirror=True)
-    plain, image = ScanPairs(vertex_maps, sequence.T_world_lidar)[1], mirrored(pairs[1])
-    counts = Counter(bool((pairs[1]["reference"] == plain["reference"]).all()) for _ in range(200))
-    assert image.keys() == plain.keys()
-    assert 70 < counts[True] < 130
+def test_a_pair_may_skip_scans_but_not_beyond_the_last(sequence, vertex_maps):
+    pairs = ScanPairs(vertex_maps, sequence.T_world_lidar, step=lambda: 3)
+    assert len(pairs) == 4
+    for first, second in ((0, 3), (1, 4), (2, 4), (3, 4)):
+        assert torch.equal(pairs[first]["target"], vertex_maps[second])
+        moved = sequence.T_world_lidar[first] @ pairs[first]["T_ref_new"]
+        torch.testing.assert_close(moved, sequence.T_world_lidar[second])
