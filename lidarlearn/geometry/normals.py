@@ -113,9 +113,7 @@ class _Moments:
     products: Float[Tensor, "3 batch h w"]
 
 
-def _window_moments(
-    channels: Float[Tensor, "3 batch h w"], window: tuple[int, int], max_range_jump: float
-) -> _Moments:
+def _window_moments(channels: Float[Tensor, "3 batch h w"], window: tuple[int, int], max_range_jump: float) -> _Moments:
     rows, columns = window[0] // 2, window[1] // 2
     h, w = channels.shape[-2:]
     ranges = channels.norm(dim=0, keepdim=True)

@@ -11,7 +11,7 @@ from lidarlearn.geometry.normals import normal_map
 from lidarlearn.geometry.projection import SphericalProjection, activated
 from lidarlearn.registration.association.base import Association, Correspondences, no_correspondences
 
-_NOTHING = torch.iinfo(torch.int64).max
+_NOTHING = torch.iinfo(torch.int64).max  # its lower 32 bits are -1
 
 
 class Projective(Association):
@@ -61,23 +61,29 @@ class Projective(Association):
         if self.is_empty:
             return no_correspondences(points_world)
         pixel = self.projection.pixel_index(se3.transform(self._T_lidar_world, points_world))
-        candidates = self._layers[pixel.clamp(min=0)]
-        squared = (self._points[candidates.clamp(min=0)] - points_world[:, None]).square().sum(-1)
-        squared = torch.where((candidates >= 0) & (pixel >= 0)[:, None], squared, torch.inf)
+        candidates = self._layers.index_select(0, pixel.clamp(min=0))
+        offsets = self._points.index_select(0, candidates.flatten().clamp(min=0)).view(*candidates.shape, 3)
+        offsets -= points_world[:, None]
+        squared = offsets.square_() @ offsets.new_ones(3)  # a sum over so few is slow
+        squared.masked_fill_((candidates < 0) | (pixel < 0)[:, None], torch.inf)
         best = squared.min(dim=1)
         index = candidates.gather(1, best.indices[:, None])[:, 0].clamp(min=0)
         return Correspondences(self._points[index], self._normals[index], best.values <= max_distance_m**2)
 
     def _project(self) -> Tensor:
         """Index of the nearest point of each scan in each pixel, (pixels, scans), -1 where there is none."""
-        local = se3.transform(self._T_lidar_world, self._points)
-        pixel = self.projection.pixel_index(local)
+        T = self._T_lidar_world.float()
+        local = torch.addmm(T[:3, 3:], T[:3, :3], self._points.T)  # coordinates apart, as projections like them
+        pixel = self.projection.pixel_index(local.T)
         scans = len(self._frames)
         lengths = torch.tensor([len(points) for points, _ in self._frames], device=self._device)
         layer = torch.arange(scans, device=self._device).repeat_interleave(lengths)
-        slot = torch.where(pixel < 0, self.projection.pixels * scans, pixel * scans + layer)
-        key = local.norm(dim=1).view(torch.int32).long() << 32 | torch.arange(len(local), device=self._device)
-        layers = torch.full((self.projection.pixels * scans + 1,), _NOTHING, device=self._device)
+        last = self.projection.pixels * scans  # where points go that fall into no pixel
+        slot = torch.where(pixel < 0, last, pixel.mul_(scans).add_(layer))
+        x, y, z = local
+        squared_ranges = (x * x).addcmul_(y, y).addcmul_(z, z)
+        key = squared_ranges.view(torch.int32).long().bitwise_left_shift_(32)
+        key |= torch.arange(len(pixel), device=self._device)
+        layers = torch.full((last + 1,), _NOTHING, device=self._device)
         layers.scatter_reduce_(0, slot, key, "amin")
-        index = torch.where(layers == _NOTHING, -1, layers & 0xFFFFFFFF)[:-1]
-        return index.unflatten(0, (self.projection.pixels, scans))
+        return layers[:-1].to(torch.int32).unflatten(0, (self.projection.pixels, scans))  # the lower half of each key
