@@ -1,5 +1,7 @@
 """Simulated drives written in each native format, read back by its reader, and driven by an odometry."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from lidarlearn.commands.data import compose_data_set, main
 from lidarlearn.data.export.formats import export
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
+from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl32_inverted, hdl64
 from tests.odometry.odometries import build, motion_errors, poses
@@ -27,8 +30,11 @@ FORMATS = {
 TIME_TOLERANCE = 3e-3  # of a sweep: azimuths shift by a fraction of a column from scan to scan
 
 
+@cache
 def simulated(sensor, distorted, frames=FRAMES):
-    return Drive("urban", seed=4, frames=frames, speed=9.0, sensor=sensor, motion_distortion=distorted)
+    """9 m/s through a slight turn."""
+    path = scenes.straight_path(frames + 2, 0.9, yaw_step=0.02)
+    return Drive(scenes.street(), poses=path, frames=frames, sensor=sensor, motion_distortion=distorted)
 
 
 def target_of(name, root):
@@ -121,6 +127,7 @@ def test_what_a_format_cannot_hold_is_said(name, distorted, said, tmp_path):
         export(simulated(hdl64(64), distorted, frames=2), target_of(name, tmp_path), "2012-01-08_drive_1")
 
 
+@pytest.mark.slow
 def test_the_command_writes_all_sequences_and_tells_how_to_train_on_them(tmp_path, capsys):
     arguments = [
         "export",

@@ -46,7 +46,7 @@ def test_the_loss_falls(run):
     what = "translation_squared_m2" if loss == "supervised" else "loss"
     losses = [value for _, value in curves(folder)[f"train/{what}_epoch"]]
     assert len(losses) == EPOCHS
-    assert min(losses[1:]) < 0.8 * losses[0]
+    assert min(losses[1:]) < 0.9 * losses[0]
 
 
 def test_the_curves_that_were_promised(run):
