@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 from rich.console import Console
@@ -27,7 +26,7 @@ from torch import Tensor
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.data import compose_data_set
 from lidarlearn.commands.evaluate import build_odometry
-from lidarlearn.evaluation.methods import parse_method
+from lidarlearn.evaluation.methods import BASELINES, parse_method
 from lidarlearn.metrics.absolute import ape_rmse
 from lidarlearn.metrics.relative import relative_errors
 from lidarlearn.simulation.drive import Drive
@@ -50,8 +49,8 @@ class Row:
     mean_rpe_cm: float
 
 
-def ours(method: str, device: str) -> Runner:
-    """An odometry of this project, as `evaluate.py` builds it."""
+def runner(method: str, device: str) -> Runner:
+    """A method as `evaluate.py` builds it."""
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
         config = compose("evaluate", ["projection@data.projection=hdl64", f"device={device}"])
 
@@ -60,38 +59,6 @@ def ours(method: str, device: str) -> Runner:
         return torch.stack([odometry.register_scan(points).T_world_lidar for points in scans])
 
     return run
-
-
-def kiss_icp(scans: list[Tensor]) -> Tensor:
-    """KISS-ICP with its defaults, no deskewing."""
-    from kiss_icp.config import load_config
-    from kiss_icp.kiss_icp import KissICP
-
-    config = load_config(None)
-    config.data.deskew, config.data.max_range = False, 100.0
-    config.mapping.voxel_size = config.mapping.voxel_size or 1.0
-    odometry, poses = KissICP(config), []
-    for points in scans:
-        odometry.register_frame(points.double().numpy(), np.zeros(len(points)))
-        poses.append(odometry.last_pose.copy())
-    return torch.from_numpy(np.stack(poses))
-
-
-def small_gicp(scans: list[Tensor]) -> Tensor:
-    """small_gicp's voxelized GICP to an incremental map, with a constant-velocity guess, as its odometry example."""
-    import small_gicp as library
-
-    target = library.GaussianVoxelMap(1.0)
-    target.set_lru(horizon=100, clear_cycle=10)
-    T, motion, poses = np.eye(4), np.eye(4), []
-    for i, points in enumerate(scans):
-        cloud, _ = library.preprocess_points(points.double().numpy(), 0.25, num_threads=2)
-        if i:
-            result = library.align(target, cloud, T @ motion, max_correspondence_distance=1.0, num_threads=2)
-            motion, T = np.linalg.inv(T) @ result.T_target_source, result.T_target_source
-        target.insert(cloud, T)
-        poses.append(T)
-    return torch.from_numpy(np.stack(poses))
 
 
 def drives(kitti: Path | None, scans: int) -> dict[str, tuple[list[Tensor], Tensor]]:
@@ -114,9 +81,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="of our methods")
     options = parser.parse_args()
     scans, rounds = (8, 1) if options.quick else (50, 5)
-    runners: dict[str, Runner] = {"KISS-ICP": kiss_icp, "small_gicp": small_gicp} | {
-        m: ours(m, options.device) for m in METHODS
-    }
+    runners = {method: runner(method, options.device) for method in (*BASELINES, *METHODS)}
     rows = []
     for name, (points, true) in drives(options.kitti, scans).items():
         seconds: dict[str, list[float]] = {method: [] for method in runners}
@@ -127,7 +92,7 @@ def main() -> None:
                 poses[method] = run(points)
                 seconds[method].append(time.perf_counter() - start)
         for method in runners:
-            pace = statistics.median(k / s for k, s in zip(seconds["KISS-ICP"], seconds[method], strict=True))
+            pace = statistics.median(k / s for k, s in zip(seconds["kiss_icp"], seconds[method], strict=True))
             rpe_cm = 100 * float(relative_errors(poses[method], true).translation.mean())
             per_second = len(points) / statistics.median(seconds[method])
             rows.append(Row(name, method, per_second, pace, float(ape_rmse(poses[method], true)), rpe_cm))

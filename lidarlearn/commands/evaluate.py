@@ -23,7 +23,7 @@ from lidarlearn.commands import entry_point
 from lidarlearn.commands.run_folder import git_revision, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
-from lidarlearn.evaluation.methods import Method, parse_method
+from lidarlearn.evaluation.methods import BASELINES, Method, parse_method
 from lidarlearn.evaluation.plots import figures, write_plots
 from lidarlearn.evaluation.report import print_tables, write_report
 from lidarlearn.evaluation.run import Export, RunProgress, read_export, run_odometry
@@ -130,7 +130,9 @@ def _foreign(config: DictConfig, sequences: Mapping[str, Sequence]) -> Iterator[
 
 
 def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
-    """A fresh odometry for a method, from the groups `initialization`, `odometry` and `pipeline`."""
+    """A fresh odometry for a method, from the groups `initialization`, `odometry` and `pipeline`, or `baseline`."""
+    if method.initialization in BASELINES:
+        return instantiate(config.baseline[method.initialization])
     initialization = instantiate(config.initialization[method.initialization])
     if method.backend is None:
         return InitializationAlone(initialization, config.device)

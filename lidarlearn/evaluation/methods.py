@@ -1,4 +1,4 @@
-"""Names of methods, as in the paper: `<initialization>+<association>_<map>`, or an initialization alone."""
+"""Names of methods: `<initialization>+<association>_<map>` as in the paper, an initialization alone, or a baseline."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ from lidarlearn.errors import UserError
 
 INITIALIZATIONS = ("ni", "cv", "ei", "posenet")
 BACKENDS = tuple(f"{association}_{map_}" for association in ("p", "kd", "vh") for map_ in ("f2f", "f2m"))
+BASELINES = ("kiss_icp", "small_gicp")
 
 
 @dataclass(frozen=True)
@@ -13,8 +14,8 @@ class Method:
     """A method by its parts.
 
     Args:
-        initialization: ni, cv, ei or posenet.
-        backend: e.g. "kd_f2m"; None where the initialization is scored alone.
+        initialization: ni, cv, ei or posenet; or a baseline, which brings its own.
+        backend: e.g. "kd_f2m"; None where the initialization is scored alone, and for baselines.
     """
 
     initialization: str
@@ -31,10 +32,13 @@ def parse_method(name: str) -> Method:
         UserError: there is no such method.
     """
     initialization, plus, backend = name.lower().partition("+")
+    if name.lower() in BASELINES:
+        return Method(name.lower())
     if initialization not in INITIALIZATIONS or (plus and backend not in BACKENDS):
         raise UserError(
             f"methods: there is no method '{name}'.\n"
             f"  change: <initialization>+<association>_<map>, e.g. cv+kd_f2m, or an initialization alone; "
-            f"initializations are {', '.join(INITIALIZATIONS)}, the rest is one of {', '.join(BACKENDS)}"
+            f"initializations are {', '.join(INITIALIZATIONS)}, the rest is one of {', '.join(BACKENDS)}; "
+            f"for comparison there are {', '.join(BASELINES)}"
         )
     return Method(initialization, backend if plus else None)

@@ -1,0 +1,100 @@
+"""Odometries by others, run and scored like our own; each needs its own package."""
+
+import importlib
+from types import ModuleType
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.errors import UserError
+from lidarlearn.odometry.health import Health
+from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
+
+
+class KissIcp(ScanByScan):
+    """KISS-ICP.
+
+    Args:
+        min_range_m: closer returns are dropped [m].
+        max_range_m: farther returns are dropped [m].
+        voxel_size_m: of its map [m]; None is a hundredth of the range.
+
+    Source: Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
+    """
+
+    def __init__(self, min_range_m: float = 0.0, max_range_m: float = 100.0, voxel_size_m: float | None = None) -> None:
+        _required("kiss_icp", "kiss-icp")
+        from kiss_icp.config import load_config
+        from kiss_icp.kiss_icp import KissICP
+
+        config = load_config(None)
+        config.data.min_range, config.data.max_range = min_range_m, max_range_m
+        config.mapping.voxel_size = voxel_size_m or max_range_m / 100
+        config.data.deskew = True  # without times there is nothing to compensate
+        self._odometry = KissICP(config)
+        self._frames = 0
+
+    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+        """Its pose of the scan; without times, nothing is deskewed."""
+        used = points.isfinite().all(dim=1)
+        stamps = np.zeros(0) if times is None else (times[used].double().numpy() + 0.5)
+        self._odometry.register_frame(points[used].double().cpu().numpy(), stamps)
+        health = Health(self._frames, initialization="kiss_icp", points=int(used.sum()))
+        self._frames += 1
+        return Frame(torch.from_numpy(self._odometry.last_pose.copy()), health)
+
+
+class SmallGicp(ScanByScan):
+    """small_gicp: generalized ICP to an incremental voxel map, from a constant-velocity guess; it does not deskew.
+
+    Args:
+        voxel_size_m: of the map [m].
+        sampling_m: grid on which scans are sampled [m].
+        search_distance_m: of correspondences [m].
+        threads: that it may use.
+
+    Source: Koide, "small_gicp: Efficient and parallel algorithms for point cloud registration", JOSS 2024.
+    """
+
+    def __init__(
+        self, voxel_size_m: float = 1.0, sampling_m: float = 0.25, search_distance_m: float = 1.0, threads: int = 2
+    ) -> None:
+        self._library = _required("small_gicp", "small_gicp")
+        self._map = self._library.GaussianVoxelMap(voxel_size_m)
+        self._map.set_lru(horizon=100, clear_cycle=10)
+        self._sampling_m, self._search_distance_m, self._threads = sampling_m, search_distance_m, threads
+        self._T_world_lidar, self._motion = np.eye(4), np.eye(4)
+        self._frames = 0
+
+    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+        """Its pose of the scan; times are not used. A scan without points moves on as the last one did."""
+        used = points[points.isfinite().all(dim=1)].double().cpu().numpy()
+        guess = self._T_world_lidar @ self._motion
+        if len(used):
+            cloud, _ = self._library.preprocess_points(used, self._sampling_m, num_threads=self._threads)
+            if self._map.size():
+                result = self._library.align(
+                    self._map,
+                    cloud,
+                    guess,
+                    max_correspondence_distance=self._search_distance_m,
+                    num_threads=self._threads,
+                )
+                guess = result.T_target_source
+            self._map.insert(cloud, guess)
+        self._motion = np.linalg.inv(self._T_world_lidar) @ guess
+        self._T_world_lidar = guess
+        health = Health(self._frames, initialization="small_gicp", points=len(used))
+        self._frames += 1
+        return Frame(torch.from_numpy(guess.copy()), health)
+
+
+def _required(module: str, package: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"methods: {module} needs the package {package}.\n  change: pip install {package}, or leave it out"
+        ) from error
