@@ -3,9 +3,12 @@
 import os
 import sys
 from collections.abc import Callable
+from typing import NoReturn
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -38,17 +41,25 @@ def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[
     def task_with_readable_errors(config: DictConfig) -> None:
         try:
             task(config)
-        except Exception as error:  # Hydra would announce the error before it hands it on
-            _exit_if_readable(error)
-            raise
+        except Exception as error:
+            message = readable_message(error)
+            hydra_config = HydraConfig.get()
+            if message is None:
+                raise
+            if hydra_config.mode != RunMode.MULTIRUN:  # Hydra would announce the error before it hands it on
+                _exit(message)
+            # The other jobs go on; the message alone also finds its way out of another process.
+            raise UserError(f"job {hydra_config.job.num}: {message}") from error
 
     os.environ[_FULL_ERROR] = "1"  # Hydra hands its errors on instead of printing them in its own way
     try:
         prepare()
         _application(task_with_readable_errors, config_name)()
     except Exception as error:
-        _exit_if_readable(error)
-        raise
+        message = readable_message(error)
+        if message is None:
+            raise
+        _exit(message)
     finally:
         del os.environ[_FULL_ERROR]
 
@@ -84,8 +95,6 @@ def _application(task: Callable[[DictConfig], None], config_name: str) -> Callab
     return hydra.main(version_base="1.3", config_path=str(config_directory()), config_name=config_name)(task)
 
 
-def _exit_if_readable(error: Exception) -> None:
-    message = readable_message(error)
-    if message is not None:
-        print(f"error: {message}", file=sys.stderr, flush=True)
-        sys.exit(1)
+def _exit(message: str) -> NoReturn:
+    print(f"error: {message}", file=sys.stderr, flush=True)
+    sys.exit(1)

@@ -18,19 +18,20 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
 from torch import Tensor
 
-import lidarlearn
 from lidarlearn.commands import entry_point
-from lidarlearn.commands.run_folder import git_revision, write_run_description
+from lidarlearn.commands.protocol import differing_settings, evaluation_protocol, method_settings
+from lidarlearn.commands.run_folder import code_digest, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
+from lidarlearn.evaluation.layout import TableLayout
 from lidarlearn.evaluation.methods import BASELINES, Method, parse_method
 from lidarlearn.evaluation.plots import figures, write_plots
-from lidarlearn.evaluation.report import print_tables, write_report
+from lidarlearn.evaluation.report import print_tables, report_tables, sequences_trained_on, write_report
 from lidarlearn.evaluation.run import Export, RunProgress, read_export, run_odometry
 from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.trajectories import find_trajectories, read_trajectory, to_lidar_frame
 from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
-from lidarlearn.training.checkpoints import load_checkpoint, sha256
+from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.parts import require_trusted
 
 _WITH_NETWORK = ("posenet", "posenet+p_f2m", "cv+p_f2m")
@@ -76,13 +77,14 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
         config.device = _device(config.device)
     run_folder = Path(config.run_dir)
     methods = _methods(config)
+    layout: TableLayout | None = instantiate(config.table, _convert_="all")
     data: DataSet = instantiate(config.data)
     data.prepare()
     sequences = {name: data.sequence(name) for name in data.test_sequences}
     if not sequences:
         raise UserError('data.test_sequences is empty\n  change: data.test_sequences=["..."]')
     write_run_description(run_folder, config)
-    protocol = _protocol(config, data_name)
+    protocol = evaluation_protocol(config, data_name, methods, sequences)
     poses: dict[str, dict[str, Tensor]] = {}
     scores: list[Score] = []
     results = _foreign(config, sequences) if config.trajectories else _own(config, methods, sequences, run_folder)
@@ -92,28 +94,38 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
             poses.setdefault(row.method, {})[row.sequence] = T_world_lidar
     finally:
         if scores:
-            _report(run_folder, protocol, Evaluation(sequences, poses, scores))
+            _report(run_folder, protocol, Evaluation(sequences, poses, scores), layout)
     return Evaluation(sequences, poses, scores)
 
 
 def _own(
     config: DictConfig, methods: Series[Method], sequences: Mapping[str, Sequence], run_folder: Path
 ) -> Iterator[tuple[Score, Tensor]]:
-    """Run every method on every sequence, and score what they export."""
+    """Run every method on every sequence, unless the run folder holds that run, and score what they export."""
+    code = code_digest()
     with RunProgress() as progress:
         for method in methods:
+            own = {**method_settings(config, method), "code": code}
             for sequence in sequences.values():
                 export = Export(run_folder / "trajectories" / str(method), sequence.name)
-                task = progress.start(str(method), sequence)
-                odometry = build_odometry(config, method)
-                run_odometry(odometry, sequence, export, config.data.deskew, partial(progress.advance, task))
+                settings = {"scans": sequence.fingerprint, **own}
+                found = export.settings()
+                if found != settings:
+                    if found is not None:
+                        progress.line(f"{method} on {sequence.name}: run anew, {differing_settings(found, settings)}")
+                    task = progress.start(str(method), sequence)
+                    advance = partial(progress.advance, task)
+                    run_odometry(
+                        build_odometry(config, method), sequence, export, config.data.deskew, advance, settings
+                    )
+                    progress.remove(task)
                 T_world_lidar, summary = read_export(export, sequence)
-                health = summary["health"]
-                progress.done(task, str(method), sequence, summary["frames_per_second"], health["flagged"])
-                yield (
-                    score(str(method), T_world_lidar, sequence, summary["frames_per_second"], health),
-                    T_world_lidar,
+                speed, health = summary["frames_per_second"], summary["health"]
+                progress.line(
+                    f"{method!s:<16} {sequence.name:<12} {len(sequence):>5} scans  {speed:6.1f} frames/s  "
+                    f"{health['flagged']} flagged{'  (found in the run folder)' if found == settings else ''}"
                 )
+                yield score(str(method), T_world_lidar, sequence, speed, health), T_world_lidar
 
 
 def _foreign(config: DictConfig, sequences: Mapping[str, Sequence]) -> Iterator[tuple[Score, Tensor]]:
@@ -130,10 +142,17 @@ def _foreign(config: DictConfig, sequences: Mapping[str, Sequence]) -> Iterator[
 
 
 def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
-    """A fresh odometry for a method, from the groups `initialization`, `odometry` and `pipeline`, or `baseline`."""
+    """A fresh odometry for a method, from the groups `initialization`, `odometry` and `pipeline`, or `baseline`.
+
+    A network is built from `initialization.posenet`, with the checkpoint that `networks` has under its name.
+    """
     if method.initialization in BASELINES:
         return instantiate(config.baseline[method.initialization])
-    initialization = instantiate(config.initialization[method.initialization])
+    if method.initialization in config.networks:
+        network = {"path": config.networks[method.initialization]}
+        initialization = instantiate(config.initialization.posenet, network=network)
+    else:
+        initialization = instantiate(config.initialization[method.initialization])
     if method.backend is None:
         return InitializationAlone(initialization, config.device)
     return instantiate(config.pipeline)(initialization, instantiate(config.odometry[method.backend]))
@@ -150,10 +169,13 @@ def _methods(config: DictConfig) -> list[Method]:
     names = config.methods
     if names is None:
         names = _WITH_NETWORK if config.ckpt else _WITHOUT_NETWORK
-    methods = [parse_method(str(name)) for name in ([names] if isinstance(names, str) else names)]
-    needing = [str(method) for method in methods if method.initialization == "posenet"]
-    if needing and config.ckpt is None and not config.trajectories:
-        raise UserError(f"{', '.join(needing)}: a trained network is needed\n  change: ckpt=RUN/checkpoints/best.ckpt")
+    names = [str(name) for name in ([names] if isinstance(names, str) else names)]
+    methods = [parse_method(name, config.networks) for name in names]
+    for method in () if config.trajectories else methods:
+        network = method.initialization
+        if network in config.networks and config.networks[network] is None:
+            setting = "ckpt" if network == "posenet" else f"networks.{network}"
+            raise UserError(f"{method}: a trained network is needed\n  change: {setting}=RUN/checkpoints/best.ckpt")
     return methods
 
 
@@ -172,54 +194,20 @@ def _seed(seed: int) -> None:
     np.random.seed(seed)
 
 
-def _protocol(config: DictConfig, data_name: str) -> dict[str, Any]:
-    """Everything that two results must have in common to be comparable, and what they were made with."""
-    data = config.data
-    return {
-        "data": data_name,
-        "sequences": list(data.test_sequences),
-        "max_frames": data.max_frames,
-        "beam_correction_deg": data.beam_correction_deg,
-        "deskew": data.deskew,
-        "trajectory_frame": "the data set's reference frame (KITTI odometry: left camera)",
-        "checkpoint": _checkpoint(config.ckpt),
-        "lidarlearn": lidarlearn.__version__,
-        "git": git_revision(),
-        "torch": torch.__version__,
-        "seed": config.seed,
-        "device": config.device,
-    }
-
-
-def _checkpoint(path: str | None) -> dict[str, Any] | None:
-    if path is None:
-        return None
-    trained_on = load_checkpoint(Path(path))["hyper_parameters"]["trained_on"]
-    return {
-        "path": path,
-        "sha256": sha256(Path(path)),
-        "trained_on": {
-            "data": trained_on["data_name"],
-            "train_sequences": trained_on["data"]["train_sequences"],
-            "loss": trained_on["loss"],
-            "git": trained_on["git"],
-        },
-    }
-
-
-def _report(run_folder: Path, protocol: dict[str, Any], evaluation: Evaluation) -> None:
+def _report(run_folder: Path, protocol: dict[str, Any], evaluation: Evaluation, layout: TableLayout | None) -> None:
     """Files, plots, TensorBoard and the printed tables."""
     from torch.utils.tensorboard import SummaryWriter  # slow to import, and only needed at the end
 
-    checkpoint = protocol["checkpoint"]
-    trained_on = checkpoint["trained_on"]["train_sequences"] if checkpoint else ()
-    write_report(run_folder, protocol, evaluation.scores, trained_on)
-    write_plots(run_folder / "plots", figures(evaluation.sequences, evaluation.T_world_lidar, evaluation.scores))
+    trained_on = sequences_trained_on(protocol)
+    scores, poses = evaluation.scores, evaluation.T_world_lidar
+    write_report(run_folder, protocol, scores, trained_on, layout)
+    groups = {} if layout is None else layout.columns
+    write_plots(run_folder / "plots", figures(evaluation.sequences, poses, scores, groups))
     with SummaryWriter(str(run_folder)) as writer:
-        for name, figure in figures(evaluation.sequences, evaluation.T_world_lidar, evaluation.scores):
+        for name, figure in figures(evaluation.sequences, poses, scores, groups):
             writer.add_figure(name, figure)
         writer.add_text("results", (run_folder / "results.md").read_text())
-    print_tables(protocol["data"], evaluation.scores, trained_on)
+    print_tables(report_tables(protocol["data"], scores, trained_on, layout))
     print(f"results: {run_folder / 'results.md'}  plots: {run_folder / 'plots'}")
 
 
@@ -235,8 +223,10 @@ def _add_data_of_checkpoint(arguments: list[str], folder: Path) -> None:
         path = OverridesParser.create().parse_override(given["ckpt"]).value()
     except OverrideParseException:
         return  # composing the configuration will say what is wrong
-    if not isinstance(path, str):
+    if path is None:
         return
+    if not isinstance(path, str):
+        raise UserError(f"{given['ckpt']}: each checkpoint may come with data of its own\n  change: add data=...")
     data = load_checkpoint(Path(path))["hyper_parameters"]["trained_on"]["data"]
     require_trusted(data)
     (folder / "data").mkdir()

@@ -21,7 +21,7 @@ from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor
 from lidarlearn.simulation.trajectories import read_poses
-from lidarlearn.simulation.worlds import preset
+from lidarlearn.simulation.worlds import PRESETS
 
 _SOURCE = "it is simulated on the spot: call prepare(), as train.py and evaluate.py do"
 
@@ -73,14 +73,13 @@ class SimulatedSequence(Sequence):
 class SimulatedDataSet(DataSet):
     """Drives through simulated worlds, made by `prepare` and kept under a fingerprint of their settings.
 
-    A sequence is called `<world>_<number>`: each number has a world and a way of its own, so that different numbers
-    for training, validation and test are different places.
+    A sequence is called `<world>_<number>`, e.g. urban_00; worlds are urban, highway, campus and segway. Each number
+    has a place and a way of its own: different numbers for training, validation and test are different places.
 
     Args:
         root: folder of the range images; any two settings can share it.
         projection: the image of the sensor.
-        world: "urban", "highway", "campus" or "segway".
-        sensor: None for the one that belongs to the world.
+        sensor: None for the one that belongs to each world.
         train_sequences: names of the sequences to train on.
         val_sequences: names of the sequences by which the best checkpoint is chosen.
         test_sequences: names of the sequences that an evaluation runs.
@@ -103,7 +102,6 @@ class SimulatedDataSet(DataSet):
         self,
         root: str | os.PathLike[str],
         projection: SphericalProjection,
-        world: str = "urban",
         sensor: Sensor | None = None,
         train_sequences: Iterable[str] = (),
         val_sequences: Iterable[str] = (),
@@ -124,8 +122,7 @@ class SimulatedDataSet(DataSet):
             raise ValueError(
                 f"simulated beams need no correction: beam_correction_deg must be 0, got {beam_correction_deg}"
             )
-        self.root, self.projection, self.world, self.sensor = Path(root), projection, world, sensor
-        self.title = f"simulated {world}"
+        self.root, self.projection, self.sensor = Path(root), projection, sensor
         self.train_sequences, self.val_sequences = tuple(train_sequences), tuple(val_sequences)
         self.test_sequences = tuple(test_sequences)
         self.frames, self.seed, self.speed, self.static = frames, seed, speed, static
@@ -137,7 +134,7 @@ class SimulatedDataSet(DataSet):
         """Open a sequence.
 
         Raises:
-            DataSetNotFoundError: it was not made yet, or it has the name of another world.
+            DataSetNotFoundError: it was not made yet, or its name is not that of a simulated drive.
         """
         drive = self._drive(name)
         folder, frames = self.folder(drive), self._wanted(drive)
@@ -173,7 +170,7 @@ class SimulatedDataSet(DataSet):
             for drive, _, _ in jobs:
                 self._describe(drive)
             if jobs:
-                _make(jobs, self.workers, f"Simulating {self.world} drives")
+                _make(jobs, self.workers)
 
     def folder(self, drive: Drive) -> Path:
         """Where the range images of a drive lie."""
@@ -186,15 +183,14 @@ class SimulatedDataSet(DataSet):
         return len(drive) if self.max_frames is None else min(len(drive), self.max_frames)
 
     def _drive(self, name: str) -> Drive:
-        match = re.fullmatch(rf"{re.escape(self.world)}_(\d+)", name)
-        if match is None:
-            problem = f"sequence {name!r} (the sequences are called {self.world}_00, {self.world}_01, ...)"
+        match = re.fullmatch(r"([a-z]+)_(\d+)", name)
+        if match is None or match[1] not in PRESETS:
+            problem = f"sequence {name!r} (they are called {'_00, '.join(PRESETS)}_00, ...)"
             raise DataSetNotFoundError(self.title, problem, self.root, _SOURCE, "data.train_sequences")
-        preset(self.world)
         poses = None if self.pose_file is None else read_poses(Path(self.pose_file), self.pose_file_frame == "camera")
         return Drive(
-            self.world,
-            seed=100_000 * self.seed + int(match[1]),
+            match[1],
+            seed=100_000 * self.seed + int(match[2]),
             frames=self.frames,
             sensor=self.sensor,
             speed=self.speed,
@@ -208,7 +204,7 @@ class SimulatedDataSet(DataSet):
         """Write beside the images how they came about, for people who wonder."""
         folder = self.folder(drive)
         folder.mkdir(parents=True, exist_ok=True)
-        settings = {"world": self.world, "seed": drive.seed, "frames": len(drive), "sensor": drive.sensor.name}
+        settings = {"world": drive.world_name, "seed": drive.seed, "frames": len(drive), "sensor": drive.sensor.name}
         settings |= {"columns": drive.sensor.columns, "static": self.static, "speed": self.speed}
         (folder / "settings.json").write_text(json.dumps(settings, indent=2))
 
@@ -227,7 +223,7 @@ def _missing(folder: Path, indices: Iterable[int]) -> list[int]:
 _Job = tuple[Drive, Path, list[int]]
 
 
-def _make(jobs: list[_Job], workers: int, title: str) -> None:
+def _make(jobs: list[_Job], workers: int) -> None:
     """Simulate and write the scans of all jobs, each one drive; drives are shared out where workers would be idle."""
     parts = max(1, workers // len(jobs))
     portions = [(drive, folder, indices[k::parts]) for drive, folder, indices in jobs for k in range(parts)]
@@ -235,7 +231,7 @@ def _make(jobs: list[_Job], workers: int, title: str) -> None:
     stop = threading.Event()
     # Threads do, and need no importable main module: ray casting and numpy's loops run without the interpreter's lock.
     with Progress(transient=True) as progress, ThreadPoolExecutor(max(1, workers)) as pool:
-        bar = progress.add_task(title, total=total)
+        bar = progress.add_task("Simulating drives", total=total)
         running = {pool.submit(_work, portion, stop, partial(progress.advance, bar)) for portion in portions}
         try:
             for future in as_completed(running):

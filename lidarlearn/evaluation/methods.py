@@ -1,5 +1,6 @@
 """Names of methods: `<initialization>+<association>_<map>` as in the paper, an initialization alone, or a baseline."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from lidarlearn.errors import UserError
@@ -14,7 +15,7 @@ class Method:
     """A method by its parts.
 
     Args:
-        initialization: ni, cv, ei or posenet; or a baseline, which brings its own.
+        initialization: ni, cv, ei, posenet or the name of another network; or a baseline, which brings its own.
         backend: e.g. "kd_f2m"; None where the initialization is scored alone, and for baselines.
     """
 
@@ -25,20 +26,25 @@ class Method:
         return self.initialization if self.backend is None else f"{self.initialization}+{self.backend}"
 
 
-def parse_method(name: str) -> Method:
+def parse_method(name: str, networks: Collection[str] = ()) -> Method:
     """The method of a name such as "cv+kd_f2m" or "posenet", in any case.
+
+    Args:
+        name: as on the command line.
+        networks: names of networks, each an initialization of its own beside "posenet".
 
     Raises:
         UserError: there is no such method.
     """
     initialization, plus, backend = name.lower().partition("+")
+    initializations = dict.fromkeys((*INITIALIZATIONS, *networks))
     if name.lower() in BASELINES:
         return Method(name.lower())
-    if initialization not in INITIALIZATIONS or (plus and backend not in BACKENDS):
+    if initialization not in initializations or (plus and backend not in BACKENDS):
         raise UserError(
             f"methods: there is no method '{name}'.\n"
             f"  change: <initialization>+<association>_<map>, e.g. cv+kd_f2m, or an initialization alone; "
-            f"initializations are {', '.join(INITIALIZATIONS)}, the rest is one of {', '.join(BACKENDS)}; "
+            f"initializations are {', '.join(initializations)}, the rest is one of {', '.join(BACKENDS)}; "
             f"for comparison there are {', '.join(BASELINES)}"
         )
     return Method(initialization, backend if plus else None)

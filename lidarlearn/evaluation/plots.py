@@ -4,6 +4,7 @@ Figures are made without pyplot, whose list of open figures would grow with a tr
 """
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Series
 from pathlib import Path
@@ -82,6 +83,29 @@ def drift_figure(title: str, averages: Mapping[str, Mapping[int, SegmentAverage]
     return figure
 
 
+def curves_figure(
+    title: str, panels: Mapping[str, Mapping[str, Mapping[float, float]]], y: str, scale: float = 1.0
+) -> Figure:
+    """Curves side by side that share the vertical axis.
+
+    Args:
+        title: what is shown.
+        panels: by the label of their horizontal axis, curves by name, each y by x.
+        y: label of the vertical axis.
+        scale: factor of every y.
+    """
+    figure = Figure(figsize=(10, 4), dpi=_DPI, layout="constrained")
+    row = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for k, (axes, (x, curves)) in enumerate(zip(row, panels.items(), strict=True)):
+        for i, (name, curve) in enumerate(curves.items()):
+            values = [scale * value for value in curve.values()]
+            axes.plot(list(curve), values, marker="o", markersize=4, label=name, **_line(i))
+        axes.set_ylim(bottom=0)
+        _finish(axes, title if k == 0 else "", x, y if k == 0 else "")
+    _legend_beside(figure, row[0])
+    return figure
+
+
 def speed_figure(title: str, true_kmh: Float[Tensor, "n"], estimated_kmh: Mapping[str, Float[Tensor, "_"]]) -> Figure:
     """How often each speed was driven, by the ground truth and by the estimates.
 
@@ -136,6 +160,7 @@ def figures(
     sequences: Mapping[str, Sequence],
     T_world_lidar: Mapping[str, Mapping[str, Poses]],
     scores: Series[Score],
+    groups: Mapping[str, Series[str]] | None = None,
 ) -> Iterator[tuple[str, Figure]]:
     """All figures of an evaluation, one by one, with the names of their files.
 
@@ -143,6 +168,7 @@ def figures(
         sequences: opened sequences by name.
         T_world_lidar: estimated poses of the LiDAR, by method and sequence.
         scores: of the same methods and sequences.
+        groups: names of sequences by what they have in common; each group gets a distribution of speeds of its own.
     """
     for name, sequence in sequences.items():
         estimates = {method: poses[name] for method, poses in T_world_lidar.items() if name in poses}
@@ -154,10 +180,13 @@ def figures(
     over = f"{len(sequences)} sequences" if len(sequences) > 3 else "sequence " + ", ".join(sequences)
     if drifts:
         yield "error_over_distance", drift_figure(over, drifts)
-    true_kmh = _all_speeds(sequences, {n: s.T_world_lidar for n, s in sequences.items() if s.T_world_lidar is not None})
-    estimated_kmh = {method: _all_speeds(sequences, poses) for method, poses in T_world_lidar.items()}
-    if any(len(kmh) for kmh in (true_kmh, *estimated_kmh.values())):
-        yield "speed_distribution", speed_figure(over, true_kmh, estimated_kmh)
+    for heading, names in {over: list(sequences), **(groups or {})}.items():
+        chosen = {name: sequence for name, sequence in sequences.items() if name in names}
+        true_kmh = _all_speeds(chosen, {n: s.T_world_lidar for n, s in chosen.items() if s.T_world_lidar is not None})
+        estimated_kmh = {method: _all_speeds(chosen, poses) for method, poses in T_world_lidar.items()}
+        if any(len(kmh) for kmh in (true_kmh, *estimated_kmh.values())):
+            suffix = "" if heading == over else "_" + re.sub(r"[^\w.-]+", "_", heading).strip("_")
+            yield f"speed_distribution{suffix}", speed_figure(heading, true_kmh, estimated_kmh)
 
 
 def write_plots(folder: Path, named_figures: Iterator[tuple[str, Figure]]) -> list[Path]:
@@ -225,11 +254,11 @@ def _positive(errors: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
 
 
 def _all_speeds(sequences: Mapping[str, Sequence], poses: Mapping[str, Poses]) -> Float[Tensor, "_"]:
-    """Speeds [km/h] over all the given sequences that have time stamps, one after the other."""
+    """Speeds [km/h] over those of the sequences that have poses and time stamps, one after the other."""
     parts = [torch.zeros(0, dtype=torch.float64)]
-    for name, T_world in poses.items():
-        timestamps = sequences[name].timestamps
-        if timestamps is not None:
+    for name, sequence in sequences.items():
+        timestamps, T_world = sequence.timestamps, poses.get(name)
+        if timestamps is not None and T_world is not None:
             parts.append(_KMH * speeds(T_world.cpu(), timestamps))
     return torch.cat(parts)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
+from lidarlearn.evaluation.layout import TableLayout, network_of
 from lidarlearn.evaluation.published import published_beside, whole_kitti_sequences
 from lidarlearn.evaluation.score import Averages, Score, average_scores
 from lidarlearn.evaluation.tables import Table
@@ -19,8 +20,16 @@ _UNDEFINED = "-"
 _PIPE_WIDTH = 200  # characters, where there is no terminal to ask
 
 
+TrainedOn = Mapping[str, Collection[str]]
+_NO_NETWORK: TrainedOn = {}
+
+
 def write_report(
-    folder: Path, protocol: Mapping[str, Any], scores: Series[Score], trained_on: Collection[str] = ()
+    folder: Path,
+    protocol: Mapping[str, Any],
+    scores: Series[Score],
+    trained_on: TrainedOn = _NO_NETWORK,
+    layout: TableLayout | None = None,
 ) -> None:
     """Write `results.json` and `results.md` into a folder.
 
@@ -29,62 +38,78 @@ def write_report(
         protocol: how the scores came about; `protocol["data"]` is the name of the data group. Plain values, paths
             and nested mappings and lists of these.
         scores: all methods on all sequences, in the order in which they are to be shown.
-        trained_on: names of the scored sequences on which a scored network was trained; marked in the table.
+        trained_on: names of the sequences on which each network was trained, by the name that it has in methods.
+        layout: how an experiment sums up its sequences; None for no table of that kind.
+    """
+    results = {"protocol": protocol, **results_content(scores)}
+    if layout is not None:
+        results["table"] = asdict(layout)
+    tables = report_tables(str(protocol.get("data", "")), scores, trained_on, layout)
+    write_results(folder, results, tables, protocol_markdown(protocol))
+
+
+def write_results(folder: Path, results: Mapping[str, Any], tables: Series[Table], closing: str) -> None:
+    """Write `results.json`, and `results.md` with some tables and a last section.
+
+    Raises:
+        TypeError: `results` holds something that JSON cannot.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    content = {
-        "protocol": protocol,
-        "results": [asdict(row) for row in scores],
-        "averages": [asdict(row) for row in average_scores(scores)],
-    }
-    text = json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(_plain(results), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / "results.json").write_text(text + "\n", encoding="utf-8")
-    tables = report_tables(str(protocol.get("data", "")), scores, trained_on)
     body = "\n".join(table.markdown() for table in tables)
-    (folder / "results.md").write_text(f"# Results\n\n{body}\n{_protocol_markdown(protocol)}", encoding="utf-8")
+    (folder / "results.md").write_text(f"# Results\n\n{body}\n{closing}", encoding="utf-8")
 
 
-def print_tables(
-    data: str, scores: Series[Score], trained_on: Collection[str] = (), console: Console | None = None
-) -> None:
-    """Print the tables of `results.md` to the terminal, or to another console.
+def sequences_trained_on(protocol: Mapping[str, Any]) -> TrainedOn:
+    """Which sequences each network of a protocol was trained on, by the network's name in methods."""
+    networks = {"posenet": protocol.get("checkpoint"), **protocol.get("networks", {})}
+    return {name: network["trained_on"]["train_sequences"] for name, network in networks.items() if network}
 
-    Args:
-        data: name of the data group.
-        scores: as for `write_report`.
-        trained_on: as for `write_report`.
-        console: where to print; None takes the standard output.
-    """
+
+def results_content(scores: Series[Score]) -> dict[str, Any]:
+    """Scores and their averages as `results.json` holds them."""
+    averages = average_scores(scores)
+    return {"results": [asdict(row) for row in scores], "averages": [asdict(row) for row in averages]}
+
+
+def print_tables(tables: Series[Table], console: Console | None = None) -> None:
+    """Print tables to the terminal, or to another console; None takes the standard output."""
     out = console or Console()
     if console is None and not out.is_terminal:
         out = Console(width=_PIPE_WIDTH)
-    for table in report_tables(data, scores, trained_on):
+    for table in tables:
         table.print(out)
 
 
-def report_tables(data: str, scores: Series[Score], trained_on: Collection[str] = ()) -> list[Table]:
-    """The paper's kind of table, one column a sequence, then everything else, one row a method and sequence."""
-    return [drift_table(data, scores, trained_on), details_table(scores)]
+def report_tables(
+    data: str, scores: Series[Score], trained_on: TrainedOn = _NO_NETWORK, layout: TableLayout | None = None
+) -> list[Table]:
+    """The experiment's table; the paper's kind of table, a column a sequence; then everything else, a row each.
+
+    Arguments as for `write_report`, `data` being the name of the data group.
+    """
+    tables = [drift_table(data, scores, trained_on), details_table(scores)]
+    return tables if layout is None else [layout.table(scores, trained_on), *tables]
 
 
-def drift_table(data: str, scores: Series[Score], trained_on: Collection[str] = ()) -> Table:
+def drift_table(data: str, scores: Series[Score], trained_on: TrainedOn = _NO_NETWORK) -> Table:
     """Average translation error of each method on each sequence and both averages, with published rows where due."""
     sequences = list(dict.fromkeys(row.sequence for row in scores))
-    cells = {(row.method, row.sequence): _drift_cell(row) for row in scores}
+    cells = {(row.method, row.sequence): _drift_cell(row, trained_on) for row in scores}
     averages = average_scores(scores)
     complete = max((row.mean_over_sequences.sequences for row in averages), default=0)
     rows = [
         (row.method, *(cells.get((row.method, name), _UNDEFINED) for name in sequences), *_means(row, complete))
         for row in averages
     ]
-    marked = [f"{name}*" if name in trained_on else name for name in sequences]
     reference = _reference_rows(data, scores, sequences)
     return Table(
         title="Average translation error [%], KITTI metric",
-        columns=("method", *marked, "mean of sequences", "mean of segments"),
+        columns=("method", *sequences, "mean of sequences", "mean of segments"),
         rows=tuple(rows),
         reference=tuple(reference),
-        notes=tuple(_drift_notes(scores, trained_on, sequences, bool(reference))),
+        notes=tuple(_drift_notes(scores, rows, bool(reference))),
         lowest=frozenset(range(1, len(sequences) + 3)),
     )
 
@@ -119,12 +144,13 @@ def details_table(scores: Series[Score]) -> Table:
     )
 
 
-def _drift_cell(row: Score) -> str:
+def _drift_cell(row: Score, trained_on: TrainedOn) -> str:
     """The percentage; where the drive is too short for it, the mean error between scans stands in, in brackets."""
+    star = "*" if row.sequence in trained_on.get(network_of(row.method), ()) else ""
     if row.avg_translation_error_percent is not None:
-        return _text(row.avg_translation_error_percent, 3)
+        return _text(row.avg_translation_error_percent, 3) + star
     if row.rpe_translation_mean_m is not None:
-        return f"{_UNDEFINED} ({_text(row.rpe_translation_mean_m, 2, 100.0)} cm)"
+        return f"{_UNDEFINED} ({_text(row.rpe_translation_mean_m, 2, 100.0)} cm){star}"
     return _UNDEFINED
 
 
@@ -151,9 +177,7 @@ def _reference_rows(data: str, scores: Series[Score], sequences: Series[str]) ->
     return rows
 
 
-def _drift_notes(
-    scores: Series[Score], trained_on: Collection[str], sequences: Series[str], has_reference: bool
-) -> list[str]:
+def _drift_notes(scores: Series[Score], rows: Series[tuple[str, ...]], has_reference: bool) -> list[str]:
     notes = [
         "Mean over segments of 100 to 800 m. Two averages are in use: every sequence counts the same (mean of "
         "sequences), or every segment of all sequences (mean of segments), as on the KITTI benchmark."
@@ -165,8 +189,8 @@ def _drift_notes(
         )
     if any(row.path_length_m is None for row in scores):
         notes.append("-: no ground truth.")
-    if any(name in trained_on for name in sequences):
-        notes.append("*: a network scored here was trained on this sequence.")
+    if any(cell.endswith("*") for row in rows for cell in row):
+        notes.append("*: the network was trained on this sequence.")
     if has_reference:
         notes.append(
             "published: as printed by the authors or re-run by others, for whole sequences; not measured here. Numbers "
@@ -175,7 +199,8 @@ def _drift_notes(
     return notes
 
 
-def _protocol_markdown(protocol: Mapping[str, Any]) -> str:
+def protocol_markdown(protocol: Mapping[str, Any]) -> str:
+    """The last section of `results.md`: how the results came about."""
     lines = [f"- {key}: {_inline(_plain(value))}" for key, value in protocol.items()]
     return "### Protocol\n\n" + "\n".join(lines) + "\n"
 

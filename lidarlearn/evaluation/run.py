@@ -3,7 +3,7 @@
 import json
 import statistics
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,8 +56,14 @@ class Export:
 
     @property
     def summary(self) -> Path:
-        """Speed and the summary of the health records."""
+        """The settings of the run, its speed, the summary of the health records; written last."""
         return self.folder / f"{self.sequence}.json"
+
+    def settings(self) -> dict[str, Any] | None:
+        """The settings with which a whole run was exported; None where there is none."""
+        if not (self.summary.is_file() and self.kitti.is_file()):
+            return None
+        return json.loads(self.summary.read_text()).get("settings")
 
 
 def run_odometry(
@@ -66,6 +72,7 @@ def run_odometry(
     export: Export,
     deskew: bool = False,
     advance: Callable[[], None] = lambda: None,
+    settings: Mapping[str, Any] | None = None,
 ) -> None:
     """Feed a sequence to an odometry and export trajectory, health records and speed.
 
@@ -78,7 +85,9 @@ def run_odometry(
         export: where the files go.
         deskew: whether the odometry is told the points' times.
         advance: called after each scan.
+        settings: all that the result depends on, kept with it; plain values, lists and mappings.
     """
+    export.summary.unlink(missing_ok=True)
     poses: list[Tensor] = []
     records: list[Health] = []
     seconds = 0.0
@@ -92,9 +101,9 @@ def run_odometry(
             advance()
     except UserError:
         if poses:
-            _write(Export(export.folder, f"{export.sequence}.partial"), sequence, poses, records, seconds)
+            _write(Export(export.folder, f"{export.sequence}.partial"), sequence, poses, records, seconds, settings)
         raise
-    _write(export, sequence, poses, records, seconds)
+    _write(export, sequence, poses, records, seconds, settings)
 
 
 def read_export(export: Export, sequence: Sequence) -> tuple[Float[Tensor, "n 4 4"], dict[str, Any]]:
@@ -106,7 +115,7 @@ def read_export(export: Export, sequence: Sequence) -> tuple[Float[Tensor, "n 4 
 
 
 class RunProgress:
-    """A bar for each running method and sequence, and one line that stays when it is done."""
+    """A bar for each running method and sequence, and lines that stay."""
 
     def __init__(self) -> None:
         self._console = Console()
@@ -136,14 +145,13 @@ class RunProgress:
         """One scan more."""
         self._progress.advance(task)
 
-    def done(self, task: TaskID, method: str, sequence: Sequence, frames_per_second: float, flagged: int) -> None:
-        """Replace the bar by a line."""
+    def remove(self, task: TaskID) -> None:
+        """Take a bar away."""
         self._progress.remove_task(task)
-        self._console.print(
-            f"{method:<16} {sequence.name:<12} {len(sequence):>5} scans  {frames_per_second:6.1f} frames/s  "
-            f"{flagged} flagged",
-            highlight=False,
-        )
+
+    def line(self, line: str) -> None:
+        """Print a line that stays."""
+        self._console.print(line, highlight=False, markup=False)
 
 
 def summarize_health(records: Iterable[Health]) -> dict[str, float | int | None]:
@@ -161,15 +169,24 @@ def summarize_health(records: Iterable[Health]) -> dict[str, float | int | None]
     }
 
 
-def _write(export: Export, sequence: Sequence, poses: list[Tensor], records: list[Health], seconds: float) -> None:
+def _write(
+    export: Export,
+    sequence: Sequence,
+    poses: list[Tensor],
+    records: list[Health],
+    seconds: float,
+    settings: Mapping[str, Any] | None,
+) -> None:
     T_world = to_reference_frame(torch.stack(poses), sequence.T_reference_lidar)
     timestamps = None if sequence.timestamps is None else sequence.timestamps[: len(poses)]
     write_kitti(export.kitti, T_world)
     write_tum(export.tum, T_world, timestamps)
     write_health(export.health, records)
     speed = len(poses) / max(seconds, 1e-9)
-    summary = {"frames_per_second": speed, "health": summarize_health(records)}
-    export.summary.write_text(json.dumps(summary, indent=2) + "\n")
+    summary = {"frames_per_second": speed, "health": summarize_health(records), "settings": settings or {}}
+    draft = export.summary.with_suffix(".tmp")
+    draft.write_text(json.dumps(summary, indent=2) + "\n")
+    draft.replace(export.summary)
 
 
 def _mean(values: list[int] | list[float]) -> float | None:

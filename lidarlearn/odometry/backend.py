@@ -76,7 +76,7 @@ class Backend:
         distance = min(self.registration.search_distance_m + 2 * surprise_m, self.max_search_distance_m)
         T_world_new = T_world_previous @ T_previous_new
         return self.registration.register(
-            queries, self.local_map.association, T_world_new, distance, self._normals(queries)
+            queries, self.local_map.association, T_world_new, distance, self.normals(queries)
         )
 
     def best_hypothesis(
@@ -93,12 +93,13 @@ class Backend:
             self.local_map.association,
             T_world_previous @ T_previous_new,
             self.max_search_distance_m,
-            self._normals(queries),
+            self.normals(queries),
         )
         best = result.fit.argmax()
         return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar[best]))
 
-    def _normals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"] | None:
+    def normals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"] | None:
+        """Normals of a new scan where the residual needs them, else None."""
         if not self.registration.residual.needs_normals:
             return None
         return neighbourhood_normals(points, _NORMAL_VOXEL_M)

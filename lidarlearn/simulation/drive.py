@@ -57,10 +57,10 @@ class Drive(Sequence):
             raise ValueError("a world of your own needs poses: Drive(world, poses=...)")
         self.seed, self.static, self.motion_distortion, self.speed = seed, static, motion_distortion, speed
         self._place = preset("urban" if isinstance(world, World) else world)
-        self._world_name = "custom" if isinstance(world, World) else world
+        self.world_name = "custom" if isinstance(world, World) else world
         self.sensor = self._place.sensor() if sensor is None else sensor
         self.frames = frames if poses is None else min(frames, len(poses))
-        self.name = f"{self._world_name}_{seed:02d}" if name is None else name
+        self.name = f"{self.world_name}_{seed:02d}" if name is None else name
         # Scenery goes on beyond the last scan, but not along the whole of a long file.
         self._given = None if poses is None else np.asarray(poses[: frames + 100], dtype=np.float64)
         self._own = world if isinstance(world, World) else None
@@ -75,7 +75,7 @@ class Drive(Sequence):
     @property
     def fingerprint(self) -> str:
         """Hash of the settings."""
-        settings = [GENERATOR, self._world_name, self.seed, self.frames, sorted(asdict(self.sensor).items())]
+        settings = [GENERATOR, self.world_name, self.seed, self.frames, sorted(asdict(self.sensor).items())]
         settings += [self.speed, self.static, self.motion_distortion]
         digest = hashlib.sha256(repr(settings).encode())
         if self._given is not None:

@@ -135,8 +135,16 @@ def test_a_truncated_file_is_named(made):
     path.write_bytes(whole)
 
 
-@pytest.mark.parametrize("name", ["highway_00", "urban", "00", "urban_x"])
-def test_names_of_other_worlds_are_refused(made, name):
+def test_drives_of_different_worlds_make_one_data_set(tmp_path):
+    data_set = _data_set(tmp_path, train_sequences=["urban_00", "highway_00"], max_frames=1)
+    data_set.prepare()
+    assert len(data_set.sequence("urban_00")) == len(data_set.sequence("highway_00")) == 1
+    town_m, motorway_m = (data_set._drive(name).T_world_lidar[3, :3, 3].norm() for name in ("urban_00", "highway_00"))
+    assert motorway_m > 1.5 * town_m
+
+
+@pytest.mark.parametrize("name", ["village_00", "urban", "00", "urban_x"])
+def test_names_of_no_world_are_refused(made, name):
     with pytest.raises(DataSetNotFoundError, match="urban_00"):
         made.sequence(name)
 

@@ -34,3 +34,9 @@ def test_other_names_are_refused_with_the_ones_there_are(name):
     with pytest.raises(UserError, match=r"no method '.*'\.\n  change: .*cv\+kd_f2m") as error:
         parse_method(name)
     assert all(part in str(error.value) for part in (*INITIALIZATIONS, *BACKENDS))
+
+
+def test_networks_are_initializations_by_their_own_names():
+    assert parse_method("posenet_icp+kd_f2m", ["posenet_icp"]) == Method("posenet_icp", "kd_f2m")
+    with pytest.raises(UserError, match="posenet_icp"):
+        parse_method("posenet_cpi", ["posenet_icp"])

@@ -1,0 +1,85 @@
+"""`python -m lidarlearn.evaluation compare|convergence ...`: results side by side, and basins of convergence."""
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from rich.progress import Progress
+
+from lidarlearn.commands import entry_point
+from lidarlearn.commands.compare import compare
+from lidarlearn.commands.run_folder import write_run_description
+from lidarlearn.data.sequence import DataSet
+from lidarlearn.errors import UserError
+from lidarlearn.evaluation.convergence import basin_figures, basin_tables, convergence_basin
+from lidarlearn.evaluation.plots import write_plots
+from lidarlearn.evaluation.report import print_tables
+
+_USAGE = """usage:
+  python -m lidarlearn.evaluation compare RUN RUN ... [--output DIR]
+      results of several run folders side by side; what was not measured under the same protocol is kept apart
+  python -m lidarlearn.evaluation convergence [data=...] [backends=[p_f2m,kd_f2m]] [KEY=VALUE ...]
+      how far off an initial pose may be for a registration to succeed"""
+
+
+def main() -> None:
+    """Run one of the commands."""
+    command = sys.argv[1] if len(sys.argv) > 1 else ""
+    if command == "compare":
+        _compare(sys.argv[2:])
+    elif command == "convergence":
+        del sys.argv[1]
+        entry_point.run(measure_convergence, "convergence")
+    else:
+        print(_USAGE)
+        sys.exit(2)
+
+
+def measure_convergence(config: DictConfig) -> None:
+    """Measure, print and draw the basins of convergence of the configured backends on the test sequences.
+
+    Args:
+        config: composed from `configs/convergence.yaml`.
+
+    Raises:
+        UserError: the data or a setting is not as it should be.
+    """
+    unknown = [name for name in config.backends if name not in config.odometry]
+    if unknown:
+        raise UserError(f"backends={unknown}: choose among {', '.join(config.odometry)}")
+    data: DataSet = instantiate(config.data)
+    data.prepare()
+    sequences = [data.sequence(name) for name in data.test_sequences]
+    if len(sequences) != 1:
+        raise UserError(f"data.test_sequences={list(data.test_sequences)}: one sequence is measured at a time")
+    sequence, probe = sequences[0], instantiate(config.probe)
+    folder = Path(config.run_dir)
+    write_run_description(folder, config)
+    basins = {}
+    with Progress(transient=True) as progress:
+        for name in config.backends:
+            task = progress.add_task(f"{name} on {sequence.name}", total=len(sequence))
+            backend = instantiate(config.odometry[name])
+            basins[name] = convergence_basin(backend, sequence, probe, partial(progress.advance, task))
+            progress.remove_task(task)
+    (folder / "convergence.json").write_text(json.dumps({k: asdict(v) for k, v in basins.items()}, indent=2) + "\n")
+    print_tables(basin_tables(basins))
+    (plot,) = write_plots(folder, basin_figures(f"sequence {sequence.name}", basins))
+    print(f"results: {folder / 'convergence.json'}  plot: {plot}")
+
+
+def _compare(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser("python -m lidarlearn.evaluation compare")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder of an evaluation")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="where to write results.json and results.md")
+    options = parser.parse_args(arguments)
+    try:
+        compare(options.runs, options.output)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)

@@ -1,0 +1,163 @@
+"""How far off an initial pose may be for a registration to find the right one: basins of convergence."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Sequence as Series
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from lidarlearn.data.sequence import Sequence
+from lidarlearn.evaluation.plots import curves_figure
+from lidarlearn.evaluation.tables import Table
+from lidarlearn.geometry import se3
+from lidarlearn.odometry.backend import Backend
+
+_AT_ONCE = 8  # initial poses registered together, which bounds the memory
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What is tried.
+
+    Args:
+        offsets_m: lengths by which the initial position is off, each in several horizontal directions [m].
+        angles_deg: angles by which the initial yaw is off, to both sides [deg].
+        directions: number of directions for each length.
+        every: a scan is tried out of so many; the others only fill the map.
+        min_range_m: closer returns are dropped [m].
+        max_range_m: farther returns are dropped [m].
+        success_m: a registration succeeds when it ends closer than this to the true pose [m]...
+        success_deg: ...and turned by less [deg].
+    """
+
+    offsets_m: Series[float] = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0)
+    angles_deg: Series[float] = (2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 30.0)
+    directions: int = 6
+    every: int = 20
+    min_range_m: float = 2.5
+    max_range_m: float = 100.0
+    success_m: float = 0.1
+    success_deg: float = 0.5
+
+
+@dataclass(frozen=True)
+class Basin:
+    """Share of registrations that succeed.
+
+    Args:
+        scans: number of scans that were tried.
+        by_offset_m: share by length of the initial offset [m].
+        by_angle_deg: share by initial error of the yaw [deg].
+    """
+
+    scans: int
+    by_offset_m: Mapping[float, float]
+    by_angle_deg: Mapping[float, float]
+
+
+def convergence_basin(
+    backend: Backend, sequence: Sequence, probe: Probe, advance: Callable[[], None] = lambda: None
+) -> Basin:
+    """Register scans from wrong initial poses, against a map of the scans before them at their true poses.
+
+    Args:
+        backend: a fresh one.
+        sequence: with ground truth.
+        probe: what is tried.
+        advance: called after each scan.
+
+    Raises:
+        ValueError: the sequence has no ground truth, or too few scans to try one.
+    """
+    T_true = sequence.T_world_lidar
+    if T_true is None or len(sequence) <= probe.every:
+        raise ValueError(f"sequence {sequence.name}: ground truth is needed, and more than {probe.every} scans")
+    T_error = torch.cat([_shifts(probe), _turns(probe)])
+    successes = torch.zeros(len(T_error))
+    scans = 0
+    for i, scan in enumerate(sequence):
+        ranges = scan.points.norm(dim=1)
+        points = scan.points[(ranges >= probe.min_range_m) & (ranges <= probe.max_range_m)]
+        prepared = backend.prepare(points, None)
+        if i and i % probe.every == 0:
+            successes += _successes(backend, prepared.points[prepared.is_query], T_true[i], T_error, probe)
+            scans += 1
+        backend.local_map.update(prepared.points, T_true[i])
+        advance()
+    shares = (successes / scans).split([len(probe.offsets_m) * probe.directions, len(probe.angles_deg) * 2])
+    by_offset = shares[0].view(-1, probe.directions).mean(1).tolist()
+    by_angle = shares[1].view(-1, 2).mean(1).tolist()
+    return Basin(
+        scans,
+        dict(zip(probe.offsets_m, by_offset, strict=True)),
+        dict(zip(probe.angles_deg, by_angle, strict=True)),
+    )
+
+
+def basin_tables(basins: Mapping[str, Basin]) -> list[Table]:
+    """Success rates, one row a backend."""
+    by_unit: list[tuple[str, str, dict[str, Mapping[float, float]]]] = [
+        ("offset of the position [m]", " m", {name: b.by_offset_m for name, b in basins.items()}),
+        ("error of the yaw [deg]", " deg", {name: b.by_angle_deg for name, b in basins.items()}),
+    ]
+    tables = []
+    for what, unit, shares in by_unit:
+        steps = list(next(iter(shares.values())))
+        rows = [(name, *(f"{100 * by_step[step]:.0f}" for step in steps)) for name, by_step in shares.items()]
+        columns = ("registration", *(f"{step:g}{unit}" for step in steps))
+        tables.append(Table(f"Registrations that succeed [%] by initial {what}", columns, tuple(rows)))
+    return tables
+
+
+def basin_figures(title: str, basins: Mapping[str, Basin]) -> Iterator[tuple[str, Figure]]:
+    """Success over the initial error, one curve a backend."""
+    yield (
+        "convergence",
+        curves_figure(
+            title,
+            {
+                "initial offset of the position [m]": {name: b.by_offset_m for name, b in basins.items()},
+                "initial error of the yaw [deg]": {name: b.by_angle_deg for name, b in basins.items()},
+            },
+            "registrations that succeed [%]",
+            scale=100.0,
+        ),
+    )
+
+
+def _successes(
+    backend: Backend, points: Tensor, T_true: Float[Tensor, "4 4"], T_error: Float[Tensor, "h 4 4"], probe: Probe
+) -> Float[Tensor, "h"]:
+    """Which of the wrong initial poses lead to the true one."""
+    found = []
+    for T_some in T_error.split(_AT_ONCE):
+        result = backend.registration.register(
+            points,
+            backend.local_map.association,
+            (T_true @ T_some).to(points.device),
+            backend.max_search_distance_m,
+            backend.normals(points),
+        )
+        xi = se3.log(se3.inverse(T_true) @ result.T_world_lidar.cpu())
+        near = xi[:, :3].norm(dim=1) < probe.success_m
+        found.append((near & (xi[:, 3:].norm(dim=1) < math.radians(probe.success_deg))).float())
+    return torch.cat(found)
+
+
+def _shifts(probe: Probe) -> Float[Tensor, "h 4 4"]:
+    bearing = torch.arange(probe.directions, dtype=torch.float64) * (2 * math.pi / probe.directions)
+    unit = torch.stack([bearing.cos(), bearing.sin()], dim=1)
+    parameters = torch.zeros(len(probe.offsets_m), probe.directions, 6, dtype=torch.float64)
+    parameters[..., :2] = torch.tensor(probe.offsets_m, dtype=torch.float64)[:, None, None] * unit
+    return se3.from_euler(parameters.flatten(0, 1))
+
+
+def _turns(probe: Probe) -> Float[Tensor, "h 4 4"]:
+    angles = torch.tensor(probe.angles_deg, dtype=torch.float64).deg2rad()
+    parameters = torch.zeros(len(angles), 2, 6, dtype=torch.float64)
+    parameters[..., 5] = torch.stack([angles, -angles], dim=1)
+    return se3.from_euler(parameters.flatten(0, 1))

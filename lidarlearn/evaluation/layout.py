@@ -1,0 +1,97 @@
+"""A table as a paper sets it: groups of sequences as columns, one figure, published values below."""
+
+from collections.abc import Collection, Mapping
+from collections.abc import Sequence as Series
+from dataclasses import dataclass, field
+
+from lidarlearn.evaluation.score import MeanOverSequences, Score, average_scores
+from lidarlearn.evaluation.tables import Table
+
+_FIGURES = {
+    "avg_translation_error_percent": ("average translation error [%]", 3),
+    "relative_translation_error_percent": ("mean error of the motion between scans [% of the mean motion]", 2),
+    "registration_failures": ("registration failures, motions off by more than 1 m or 3 deg", 0),
+    "ape_rmse_m": ("absolute pose error, RMSE [m]", 3),
+}
+
+
+@dataclass(frozen=True)
+class TableLayout:
+    """How the sequences of an experiment are summed up.
+
+    Args:
+        title: what is compared, and in which table of which paper.
+        columns: names of sequences by the heading that they share.
+        figure: what each cell shows, a field of `MeanOverSequences`: the mean over the column's sequences, or the sum
+            where it is a number of failures.
+        published: what others report for a row, in the order of the columns; None where they report nothing.
+        source: where the published values come from, and on which data.
+
+    Raises:
+        ValueError: the figure is none of those that a table can show, or a published row has another length.
+    """
+
+    title: str
+    columns: Mapping[str, Series[str]]
+    figure: str = "avg_translation_error_percent"
+    published: Mapping[str, Series[float | None]] = field(default_factory=dict)
+    source: str = "published"
+
+    def __post_init__(self) -> None:
+        if self.figure not in _FIGURES:
+            raise ValueError(f"table.figure={self.figure}: choose one of {', '.join(_FIGURES)}")
+        for method, values in self.published.items():
+            if len(values) != len(self.columns):
+                raise ValueError(f"table.published.{method}: {len(values)} values for {len(self.columns)} columns")
+
+    def table(self, scores: Series[Score], trained_on: Mapping[str, Collection[str]]) -> Table:
+        """The table of what was measured.
+
+        Args:
+            scores: of all methods on all sequences.
+            trained_on: names of sequences by the network, i.e. the initialization, that was trained on them.
+        """
+        what, digits = _FIGURES[self.figure]
+        methods = dict.fromkeys(row.method for row in scores)
+        rows = [(m, *(self._cell(m, names, scores, trained_on, digits) for names in self.columns.values()))
+                for m in methods]  # fmt: skip
+        reference = [
+            (f"{method} ({self.source})", *("-" if value is None else f"{value:g}" for value in values))
+            for method, values in self.published.items()
+        ]
+        notes = [f"Each cell: {what}; {_pooling(self.figure)} the sequences of its column."]
+        notes += [f"{heading}: {', '.join(names)}." for heading, names in self.columns.items() if heading not in names]
+        if any("*" in cell for row in rows for cell in row):
+            notes.append("*: the network was trained on these sequences.")
+        if any("(" in cell for row in rows for cell in row[1:]):
+            notes.append("(n of m): only so many of the sequences were run.")
+        return Table(self.title, ("method", *self.columns), tuple(rows), tuple(reference), tuple(notes),
+                     lowest=frozenset(range(1, len(self.columns) + 1)))  # fmt: skip
+
+    def _cell(
+        self,
+        method: str,
+        names: Series[str],
+        scores: Series[Score],
+        trained_on: Mapping[str, Collection[str]],
+        digits: int,
+    ) -> str:
+        rows = [row for row in scores if row.method == method and row.sequence in names]
+        if not rows:
+            return "-"
+        mean: MeanOverSequences = average_scores(rows)[0].mean_over_sequences
+        value = getattr(mean, self.figure)
+        if value is None:
+            return "-"
+        seen = set(names) <= set(trained_on.get(network_of(method), ()))
+        partly = f" ({len(rows)} of {len(names)})" if len(rows) < len(names) else ""
+        return f"{value:.{digits}f}{'*' if seen else ''}{partly}"
+
+
+def network_of(method: str) -> str:
+    """The initialization in a method's name, which may be that of a network."""
+    return method.partition("+")[0].partition(" ")[0]
+
+
+def _pooling(figure: str) -> str:
+    return "the sum over" if figure == "registration_failures" else "the mean over"
