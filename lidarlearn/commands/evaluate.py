@@ -29,6 +29,7 @@ from lidarlearn.evaluation.plots import figures, write_plots
 from lidarlearn.evaluation.report import print_tables, report_tables, sequences_trained_on, write_report
 from lidarlearn.evaluation.run import Export, RunProgress, read_export, run_odometry
 from lidarlearn.evaluation.score import Score, score
+from lidarlearn.evaluation.submission import is_kitti_test_set, write_submission
 from lidarlearn.evaluation.trajectories import find_trajectories, read_trajectory, to_lidar_frame
 from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
 from lidarlearn.training.checkpoints import load_checkpoint
@@ -95,6 +96,12 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     finally:
         if scores:
             _report(run_folder, protocol, Evaluation(sequences, poses, scores), layout)
+    if not config.trajectories and is_kitti_test_set(sequences.values()):
+        for method in methods:
+            packed = write_submission(
+                run_folder / f"submission_{method}.zip", run_folder / "trajectories" / str(method)
+            )
+            print(f"for KITTI's test server: {packed}")
     return Evaluation(sequences, poses, scores)
 
 

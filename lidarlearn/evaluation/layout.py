@@ -34,7 +34,7 @@ class TableLayout:
     title: str
     columns: Mapping[str, Series[str]]
     figure: str = "avg_translation_error_percent"
-    published: Mapping[str, Series[float | None]] = field(default_factory=dict)
+    published: Mapping[str, Series[float | int | None]] = field(default_factory=dict)
     source: str = "published"
 
     def __post_init__(self) -> None:

@@ -151,7 +151,7 @@ class RunProgress:
 
     def line(self, line: str) -> None:
         """Print a line that stays."""
-        self._console.print(line, highlight=False, markup=False)
+        self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def summarize_health(records: Iterable[Health]) -> dict[str, float | int | None]:

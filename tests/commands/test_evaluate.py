@@ -1,0 +1,191 @@
+"""`python evaluate.py` as users call it, on a folder of scans."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarlearn.commands import evaluate, evaluation
+from lidarlearn.commands.train import train
+from lidarlearn.evaluation.trajectories import write_kitti
+from tests.box_world import BoxSequence
+from tests.training.runs import configured
+
+FRAMES = 6
+SENSOR = [
+    "data.projection.height=16", "data.projection.width=96", "data.projection.fov_up_deg=15.0",
+    "data.projection.fov_down_deg=-20.0",
+]  # fmt: skip
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    """Two drives with ground truth as a folder of .npy files."""
+    root = tmp_path_factory.mktemp("scans")
+    for name in ("0", "1"):
+        drive = BoxSequence(name, FRAMES)
+        (root / name).mkdir()
+        for i, scan in enumerate(drive):
+            np.save(root / name / f"{i}.npy", scan.points.numpy())
+        write_kitti(root / name / "poses.txt", drive.T_world_lidar)
+    return root
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("network") / "run"
+    return train(
+        configured(folder, "trainer.max_epochs=1", "~callbacks.images", frames=9, train_sequences=["0"]), "boxes"
+    )
+
+
+@pytest.fixture
+def call(monkeypatch, capsys, scans):
+    """Runs evaluate.py on the folder; what it prints."""
+
+    def run(*arguments):
+        own = ["device=cpu", "data=folder", f"data.root={scans}", *SENSOR]
+        monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments, *own])
+        evaluate.main()
+        return capsys.readouterr().out
+
+    return run
+
+
+def results(folder):
+    return json.loads((folder / "results.json").read_text())
+
+
+def rows(folder):
+    return {(row["method"], row["sequence"]): row for row in results(folder)["results"]}
+
+
+def test_a_run_is_taken_up_where_it_was_left(call, tmp_path):
+    run = f"hydra.run.dir={tmp_path}"
+    call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']")
+    before = (tmp_path / "trajectories/cv+p_f2m/0.txt").stat().st_mtime_ns
+    printed = call(run, "methods=[cv+p_f2m,ni]", "data.test_sequences=['0','1']")
+    assert (tmp_path / "trajectories/cv+p_f2m/0.txt").stat().st_mtime_ns == before
+    assert printed.count("found in the run folder") == 1
+    assert set(rows(tmp_path)) == {(m, s) for m in ("cv+p_f2m", "ni") for s in ("0", "1")}
+
+
+def test_a_run_with_other_settings_is_not_taken_for_this_one(call, tmp_path):
+    run = f"hydra.run.dir={tmp_path}"
+    call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']")
+    printed = call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']", "odometry.p_f2m.local_map.size=2")
+    assert "cv+p_f2m on 0: run anew, the run folder has it with other settings (odometry)" in printed
+    settings = json.loads((tmp_path / "trajectories/cv+p_f2m/0.json").read_text())["settings"]
+    assert settings["odometry"]["local_map"]["size"] == 2
+
+
+def test_an_export_that_was_cut_short_is_run_again(call, tmp_path):
+    run = f"hydra.run.dir={tmp_path}"
+    call(run, "methods=[ni]", "data.test_sequences=['0']")
+    (tmp_path / "trajectories/ni/0.json").unlink()
+    assert "found" not in call(run, "methods=[ni]", "data.test_sequences=['0']")
+
+
+def test_networks_have_names_of_their_own(call, checkpoint, tmp_path):
+    call(
+        f"hydra.run.dir={tmp_path}", "methods=[other,other+p_f2f]", f"+networks.other='{checkpoint}'",
+        "data.test_sequences=['0']",
+    )  # fmt: skip
+    assert set(rows(tmp_path)) == {("other", "0"), ("other+p_f2f", "0")}
+    protocol = results(tmp_path)["protocol"]
+    assert protocol["checkpoint"] is None and protocol["networks"]["other"]["path"] == str(checkpoint)
+    # the network was trained on sequence 0 of the same name
+    assert "*" in (tmp_path / "results.md").read_text()
+
+
+def test_a_network_that_is_not_there_is_named(call, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        call(f"hydra.run.dir={tmp_path}", "methods=[other+p_f2f]", "+networks.other=null")
+    assert "networks.other=RUN/checkpoints/best.ckpt" in capsys.readouterr().err
+
+
+TABLE = (
+    "table={_target_:lidarlearn.evaluation.layout.TableLayout,title:both,"
+    "figure:relative_translation_error_percent,columns:{first:['0'],second:['1']}}"
+)
+
+
+def test_the_jobs_of_a_multirun_end_in_one_table(call, tmp_path):
+    printed = call(
+        "-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['1']", "methods=[ni],[cv+p_f2m]", TABLE
+    )
+    (group,) = results(tmp_path)["compared"]
+    assert [(row["method"], row["sequence"]) for row in group["results"]] == [
+        ("ni", "0"), ("ni", "1"), ("cv+p_f2m", "0"), ("cv+p_f2m", "1"),
+    ]  # fmt: skip
+    assert group["averages"][0]["mean_over_sequences"]["relative_translation_error_percent"] > 99  # it stands still
+    text = (tmp_path / "results.md").read_text()
+    assert text.startswith("# Results\n\n### both") and "first" in printed
+
+
+def test_a_job_that_fails_leaves_the_others_their_table(call, tmp_path, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['7'],['1']", "methods=[ni]")
+    assert exit_.value.code == 1
+    assert "error: job 1: " in capsys.readouterr().err
+    (group,) = results(tmp_path)["compared"]
+    assert [row["sequence"] for row in group["results"]] == ["0", "1"]
+
+
+@pytest.mark.slow
+def test_jobs_run_in_parallel_processes(scans, tmp_path):
+    program = Path(__file__).parents[2] / "evaluate.py"
+    parallel = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}"]
+    own = ["device=cpu", "data=folder", f"data.root={scans}", *SENSOR, "methods=[ni]"]
+    command = [sys.executable, str(program), *parallel, *own, "data.test_sequences=['0'],['7'],['1']"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1 and "error: job 1: " in done.stderr
+    (group,) = results(tmp_path)["compared"]
+    assert [row["sequence"] for row in group["results"]] == ["0", "1"]
+
+
+def test_compare_prints_and_writes(call, tmp_path, monkeypatch, capsys):
+    for name, size in (("a", 1), ("b", 2)):
+        call(
+            f"hydra.run.dir={tmp_path / name}", "methods=[cv+p_f2m]", "data.test_sequences=['0']",
+            f"odometry.p_f2m.local_map.size={size}",
+        )  # fmt: skip
+    folders = [str(tmp_path / name) for name in "ab"]
+    monkeypatch.setattr(sys, "argv", ["x", "compare", *folders, "--output", str(tmp_path / "both")])
+    evaluation.main()
+    printed = capsys.readouterr().out
+    assert "odometry.local_map.size=1" in printed and "size=2" in printed
+    assert (tmp_path / "both" / "results.md").is_file()
+    shutil.rmtree(tmp_path / "a")
+    with pytest.raises(SystemExit) as exit_:
+        evaluation.main()
+    assert exit_.value.code == 1 and "not the result of an evaluation" in capsys.readouterr().err
+
+
+def test_basins_of_convergence_are_measured_and_drawn(scans, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(
+        sys, "argv",
+        ["x", "convergence", "data=folder", f"data.root={scans}", *SENSOR, "data.test_sequences=['0']",
+         "backends=[p_f2m,kd_f2m]", "probe.every=3", "+probe.offsets_m=[0.1,20.0]", "+probe.angles_deg=[1.0,170.0]",
+         f"hydra.run.dir={tmp_path}"],
+    )  # fmt: skip
+    evaluation.main()
+    basins = json.loads((tmp_path / "convergence.json").read_text())
+    assert (tmp_path / "convergence.png").is_file()
+    for basin in basins.values():
+        assert basin["by_offset_m"]["0.1"] > 0.9 and basin["by_offset_m"]["20.0"] < 0.2
+        assert basin["by_angle_deg"]["1.0"] > 0.9 and basin["by_angle_deg"]["170.0"] < 0.6
+    assert "Registrations that" in capsys.readouterr().out
+
+
+def test_other_commands_say_what_there_is(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["x", "comapre"])
+    with pytest.raises(SystemExit) as exit_:
+        evaluation.main()
+    assert exit_.value.code == 2 and "convergence" in capsys.readouterr().out

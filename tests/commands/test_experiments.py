@@ -1,0 +1,68 @@
+"""Every experiment of `configs/experiment` composes into what its command needs."""
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from lidarlearn.commands.configs import config_directory
+from lidarlearn.evaluation.layout import TableLayout
+from lidarlearn.evaluation.methods import parse_method
+
+FOLDER = config_directory() / "experiment"
+
+
+def names(folder):
+    return sorted(path.relative_to(FOLDER).with_suffix("").as_posix() for path in (FOLDER / folder).glob("*.yaml"))
+
+
+TABLES = [name for name in names("paper") if name != "paper/settings"]
+
+
+def composed(program, experiment):
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        return compose(program, [f"experiment={experiment}", "run_dir=x"], return_hydra_config=True)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_has_its_methods_networks_and_columns(name):
+    config = composed("evaluate", name)
+    layout: TableLayout = instantiate(config.table, _convert_="all")
+    methods = [str(parse_method(method, config.networks)) for method in config.methods]
+    in_table = {sequence for column in layout.columns.values() for sequence in column}
+    assert set(config.data.test_sequences) <= in_table
+    assert set(methods) - set(layout.published) <= {"posenet_supervised"}  # beside the paper's rows
+    for network in {method.partition("+")[0] for method in methods} & set(config.networks):
+        assert f"network/{Path(config.networks[network]).parts[2]}" in names("network")
+
+
+def test_every_table_of_the_paper_has_a_stand_in():
+    originals = [name for name in TABLES if not name.endswith(("_sim", "_ford"))]
+    assert len(originals) == 7
+    assert {f"{name}_sim" for name in originals} <= set(TABLES)
+
+
+def test_the_papers_settings_are_those_of_its_runs():
+    config = composed("evaluate", "paper/settings")
+    p, kd = config.odometry.p_f2m, config.odometry.kd_f2m
+    assert (p.local_map.size, p.registration.max_iterations) == (20, 15)
+    assert (kd.local_map.size, kd.registration.max_iterations) == (30, 20)
+    for backend in (p, kd, config.odometry.p_f2f, config.odometry.kd_f2f):
+        weight = backend.registration.weight
+        assert weight == {"_target_": "lidarlearn.registration.weights.Proximity", "sigma_m": 0.2}
+    assert (p.local_map.key_frame_distance_m, p.local_map.key_frame_angle_deg) == (0.1, 0.3)
+    assert config.odometry.kd_f2f.local_map.size == 1 and not config.pipeline.recovery
+
+
+@pytest.mark.parametrize("name", names("network"))
+def test_a_network_is_kept_where_the_tables_look_for_it(name):
+    config = composed("train", name)
+    assert config.hydra.run.dir == f"outputs/networks/{name.removeprefix('network/')}"
+    supervised = "supervised" in name
+    assert config.loss._target_.endswith("SupervisedLoss") == supervised
+
+
+def test_the_test_server_gets_the_drives_without_public_poses():
+    config = composed("evaluate", "kitti_submission")
+    assert list(config.data.test_sequences) == [str(i) for i in range(11, 22)]

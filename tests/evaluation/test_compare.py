@@ -1,0 +1,108 @@
+"""Results of several runs side by side."""
+
+import json
+
+import pytest
+
+from lidarlearn.errors import UserError
+from lidarlearn.evaluation.compare import comparable_groups, comparison, read_run
+from lidarlearn.evaluation.layout import TableLayout
+from lidarlearn.evaluation.report import write_report, write_results
+from lidarlearn.evaluation.run import Export
+from lidarlearn.evaluation.score import score
+from lidarlearn.evaluation.trajectories import write_kitti
+
+PROTOCOL = {"data": "towns", "beam_correction_deg": 0.0, "deskew": False, "max_frames": None, "trajectory_frame": "x"}
+
+
+@pytest.fixture
+def make_run(tmp_path, make_sequence, longer):
+    """Writes the folder of a run that was off by a share of the motion, with the given settings."""
+
+    def make(name, method, sequence, share=0.01, settings=None, layout=None, **protocol):
+        folder, drive = tmp_path / name, make_sequence(sequence, 300)
+        T_world = longer(drive.T_world_lidar, share)
+        stamp = PROTOCOL | {"scans": {sequence: "f00d"}} | protocol
+        write_report(folder, stamp, [score(method, T_world, drive, 10.0)], layout=layout)
+        if settings is not None:
+            export = Export(folder / "trajectories" / method, sequence)
+            write_kitti(export.kitti, T_world)
+            export.summary.write_text(json.dumps({"settings": {"scans": "f00d"} | settings}))
+        return folder
+
+    return make
+
+
+def groups(*folders):
+    return comparable_groups([read_run(folder) for folder in folders])
+
+
+def methods(group):
+    return [(row.method, row.sequence) for row in group.scores]
+
+
+def test_scores_come_back_to_the_last_digit(make_run, make_sequence, longer):
+    drive = make_sequence("a", 300)
+    expected = score("m", longer(drive.T_world_lidar, 0.01), drive, 10.0)
+    assert read_run(make_run("r", "m", "a")).scores == [expected]
+
+
+def test_sequences_of_different_runs_make_one_row(make_run):
+    (group,) = groups(make_run("1", "m", "a", settings={"k": 1}), make_run("2", "m", "b", settings={"k": 1}))
+    assert methods(group) == [("m", "a"), ("m", "b")]
+    _, (drift, _), _ = comparison([group])
+    assert [row[0] for row in drift.rows] == ["m"]
+    assert drift.columns[1:3] == ("a", "b")
+
+
+def test_the_same_method_with_other_settings_says_which(make_run):
+    first = make_run("1", "m", "a", settings={"odometry": {"local_map": {"size": 30}, "same": 1}})
+    second = make_run("2", "m", "a", settings={"odometry": {"local_map": {"size": 20}, "same": 1}})
+    (group,) = groups(first, second)
+    assert [row.method for row in group.scores] == [
+        "m [odometry.local_map.size=30]",
+        "m [odometry.local_map.size=20]",
+    ]
+
+
+def test_a_run_that_was_repeated_keeps_both_rows(make_run):
+    (group,) = groups(make_run("1", "m", "a", settings={"k": 1}), make_run("2", "m", "a", settings={"k": 1}))
+    assert methods(group) == [("m", "a"), ("m (2)", "a")]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"beam_correction_deg": 0.205}, "beam_correction_deg: 0.0 against 0.205"),
+        ({"deskew": True}, "deskew: false against true"),
+        ({"max_frames": 50}, "max_frames: null against 50"),
+        ({"scans": {"a": "beef"}}, "scans of sequence a"),
+    ],
+)
+def test_what_was_measured_otherwise_is_kept_apart_and_says_why(make_run, change, words):
+    apart = groups(make_run("1", "m", "a"), make_run("2", "n", "a", **change), make_run("3", "o", "a"))
+    assert [methods(group) for group in apart] == [[("m", "a"), ("o", "a")], [("n", "a")]]
+    _, tables, closing = comparison(apart)
+    assert len(tables) == 4 and "(2 of 2: towns" in tables[2].title
+    assert "Not comparable: 1 and 2" in closing and words in closing
+
+
+def test_an_experiments_table_spans_data_sets(make_run, tmp_path):
+    layout = TableLayout("both", {"towns": ["a"], "campus": ["b"]}, published={"m": [1.0, 2.0]})
+    parts = groups(make_run("1", "m", "a", layout=layout), make_run("2", "m", "b", layout=layout, deskew=True))
+    content, tables, closing = comparison(parts)
+    assert tables[0].title == "both"
+    ((name, towns, campus),) = tables[0].rows
+    assert name == "m" and float(towns) > 0 and float(campus) > 0
+    write_results(tmp_path / "joint", content, tables, closing)
+    written = json.loads((tmp_path / "joint" / "results.json").read_text())
+    assert [len(group["results"]) for group in written["compared"]] == [1, 1]
+    assert "both" in (tmp_path / "joint" / "results.md").read_text()
+
+
+def test_a_folder_without_results_is_named(tmp_path):
+    with pytest.raises(UserError, match=r"results\.json: not the result of an evaluation"):
+        read_run(tmp_path)
+    (tmp_path / "results.json").write_text("{}")
+    with pytest.raises(UserError, match="results"):
+        read_run(tmp_path)

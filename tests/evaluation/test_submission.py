@@ -1,0 +1,35 @@
+"""What KITTI's test server gets."""
+
+import zipfile
+
+from lidarlearn.evaluation.run import Export
+from lidarlearn.evaluation.submission import KITTI_TEST_FRAMES, is_kitti_test_set, write_submission
+from lidarlearn.evaluation.trajectories import write_kitti
+from tests.evaluation.conftest import DriveWithoutScans
+
+
+def _test_set(T_camera_lidar, **changed):
+    frames = KITTI_TEST_FRAMES | changed
+    return [DriveWithoutScans(name, None, count, None, T_camera_lidar) for name, count in frames.items()]
+
+
+def test_only_all_eleven_whole_sequences_can_be_handed_in(T_camera_lidar):
+    assert is_kitti_test_set(_test_set(T_camera_lidar))
+    assert not is_kitti_test_set(_test_set(T_camera_lidar)[1:])
+    assert not is_kitti_test_set(_test_set(T_camera_lidar, **{"19": 100}))
+    assert not is_kitti_test_set([DriveWithoutScans(name, None, n) for name, n in KITTI_TEST_FRAMES.items()])
+
+
+def test_the_files_lie_side_by_side_with_a_pose_a_row(tmp_path, make_drive):
+    for name in KITTI_TEST_FRAMES:
+        write_kitti(Export(tmp_path / "cv+p_f2m", name).kitti, make_drive(7))
+    with zipfile.ZipFile(write_submission(tmp_path / "submission.zip", tmp_path / "cv+p_f2m")) as archive:
+        assert archive.namelist() == [f"{i}.txt" for i in range(11, 22)]
+        rows = archive.read("15.txt").decode().splitlines()
+    assert len(rows) == 7 and all(len(row.split()) == 12 for row in rows)
+
+
+def test_the_benchmark_has_43552_scans():
+    from lidarlearn.evaluation.published import KITTI_FRAMES
+
+    assert sum(KITTI_FRAMES.values()) + sum(KITTI_TEST_FRAMES.values()) == 43552
