@@ -94,7 +94,10 @@ def _module(config: DictConfig, datamodule: OdometryDataModule, data_name: str) 
             "fov_down_deg": p.fov_down_deg,
         },
     }
-    parts = {node: plain(node) for node in ("model", "loss", "optimizer", "scheduler")}
+    parts = {node: plain(node) for node in ("model", "loss", "optimizer")}
+    if config.scheduler not in config.schedulers:
+        raise UserError(f"scheduler={config.scheduler}: choose one of {', '.join(config.schedulers)}")
+    parts["scheduler"] = plain("schedulers")[config.scheduler]
     return build(plain("module"), **parts, trained_on=trained_on)
 
 

@@ -115,18 +115,16 @@ def basin_tables(basins: Mapping[str, Basin]) -> list[Table]:
 
 def basin_figures(title: str, basins: Mapping[str, Basin]) -> Iterator[tuple[str, Figure]]:
     """Success over the initial error, one curve a backend."""
-    yield (
-        "convergence",
-        curves_figure(
-            title,
-            {
-                "initial offset of the position [m]": {name: b.by_offset_m for name, b in basins.items()},
-                "initial error of the yaw [deg]": {name: b.by_angle_deg for name, b in basins.items()},
-            },
-            "registrations that succeed [%]",
-            scale=100.0,
-        ),
-    )
+
+    def percent(shares: Mapping[float, float]) -> dict[float, float]:
+        return {step: 100 * share for step, share in shares.items()}
+
+    what = "registrations that succeed [%]"
+    panels = {
+        f"{what}\ninitial offset of the position [m]": {n: percent(b.by_offset_m) for n, b in basins.items()},
+        f"{what}\ninitial error of the yaw [deg]": {n: percent(b.by_angle_deg) for n, b in basins.items()},
+    }
+    yield "convergence", curves_figure(title, panels)
 
 
 def _successes(

@@ -83,25 +83,22 @@ def drift_figure(title: str, averages: Mapping[str, Mapping[int, SegmentAverage]
     return figure
 
 
-def curves_figure(
-    title: str, panels: Mapping[str, Mapping[str, Mapping[float, float]]], y: str, scale: float = 1.0
-) -> Figure:
-    """Curves side by side that share the vertical axis.
+def curves_figure(title: str, panels: Mapping[str, Mapping[str, Mapping[float, float]]], x: str = "") -> Figure:
+    """Curves side by side, with one legend.
 
     Args:
         title: what is shown.
-        panels: by the label of their horizontal axis, curves by name, each y by x.
-        y: label of the vertical axis.
-        scale: factor of every y.
+        panels: curves by name, each y by x, by the label of the vertical axis.
+        x: label of the horizontal axis; a panel's own goes after a line break in its label.
     """
     figure = Figure(figsize=(10, 4), dpi=_DPI, layout="constrained")
-    row = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for k, (axes, (x, curves)) in enumerate(zip(row, panels.items(), strict=True)):
+    row = figure.subplots(1, len(panels), squeeze=False)[0]
+    for k, (axes, (label, curves)) in enumerate(zip(row, panels.items(), strict=True)):
         for i, (name, curve) in enumerate(curves.items()):
-            values = [scale * value for value in curve.values()]
-            axes.plot(list(curve), values, marker="o", markersize=4, label=name, **_line(i))
+            axes.plot(list(curve), list(curve.values()), marker="o", markersize=4, label=name, **_line(i))
         axes.set_ylim(bottom=0)
-        _finish(axes, title if k == 0 else "", x, y if k == 0 else "")
+        y, _, own = label.partition("\n")
+        _finish(axes, title if k == 0 else "", own or x, y)
     _legend_beside(figure, row[0])
     return figure
 

@@ -136,9 +136,17 @@ class PoseNetModule(LightningModule):
         return self.trainer.datamodule.val_sequences  # type: ignore[attr-defined]
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """Optimizer over the network and the loss (which may learn its weights), and the schedule of its rate."""
+        """Optimizer over the network and the loss (which may learn its weights), and the schedule of its rate.
+
+        A schedule that asks for `total_steps` goes by steps, others by epochs.
+        """
         optimizer = build(self.hparams["optimizer"], params=self.parameters())
-        return {"optimizer": optimizer, "lr_scheduler": build(self.hparams["scheduler"], optimizer=optimizer)}
+        schedule = dict(self.hparams["scheduler"])
+        interval = "step" if "total_steps" in schedule else "epoch"
+        if interval == "step" and schedule["total_steps"] is None:
+            schedule["total_steps"] = int(self.trainer.estimated_stepping_batches)
+        scheduler = build(schedule, optimizer=optimizer)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": interval}}
 
     def _loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
         """The loss in full precision: 16 bits resolve a point at 50 m to a quarter of a metre at best."""

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from lidarlearn.commands.configs import config_directory
 
 CONFIGS = config_directory()
-GROUPS = ("data", "datamodule", "model", "module", "loss", "optimizer", "scheduler", "trainer", "callbacks", "logger")
+GROUPS = ("data", "datamodule", "model", "module", "loss", "optimizer", "trainer", "callbacks", "logger")
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONFIGS / group).glob("*.yaml"))]
 
 
@@ -47,6 +47,12 @@ def test_every_option_composes_and_binds_to_its_target(group, option):
         check_binds(node)
 
 
+def test_every_scheduler_can_be_chosen_by_its_name():
+    config = composed()
+    assert set(config.schedulers) == {path.stem for path in (CONFIGS / "schedulers").glob("*.yaml")}
+    check_binds(OmegaConf.to_container(config.schedulers, resolve=True))
+
+
 @pytest.mark.parametrize("path", sorted((CONFIGS / "experiment").rglob("*.yaml")), ids=lambda p: p.stem)
 def test_every_experiment_that_trains_composes(path):
     name = str(path.relative_to(CONFIGS / "experiment").with_suffix(""))
@@ -57,15 +63,15 @@ def test_every_experiment_that_trains_composes(path):
 def test_kitti_is_trained_as_in_the_paper():
     config = composed("data=kitti_00-08", "loss=weighted_icp")
     assert config.optimizer["_target_"] == "torch.optim.Adam" and config.optimizer.lr == 1e-4
-    assert (config.trainer.max_epochs, config.scheduler.gamma) == (100, 0.5)
-    assert config.scheduler.milestones == [20, 40, 60, 80]
+    assert (config.trainer.max_epochs, config.scheduler) == (100, "step")
+    assert config.schedulers.step.gamma == 0.5 and config.schedulers.step.milestones == [20, 40, 60, 80]
     assert config.model.backbone == "resnet18" and config.loss.sigma_m == 0.5
     assert (config.datamodule.height, config.data.projection.height, config.data.projection.width) == (None, 64, 720)
 
 
 def test_simulated_data_brings_its_quick_recipe_which_the_command_line_overrides():
     quick, own = composed(), composed("trainer.max_epochs=3", "optimizer.lr=0.5", "datamodule.height=8")
-    assert quick.trainer.max_epochs < 100 and quick.datamodule.height == 32
+    assert quick.trainer.max_epochs < 100 and quick.datamodule.height == 32 and quick.scheduler == "cosine"
     assert (own.trainer.max_epochs, own.optimizer.lr, own.datamodule.height) == (3, 0.5, 8)
 
 
