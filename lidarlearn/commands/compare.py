@@ -25,7 +25,7 @@ def compare(runs: list[Path], output: Path | None = None) -> None:
     """
     content, tables, closing = comparison(comparable_groups([read_run(run) for run in runs]))
     print_tables(tables)
-    print(closing)
+    print(closing.replace("### ", ""))
     if output is not None:
         write_results(output, content, tables, closing)
         print(f"results: {output / 'results.md'}")

@@ -84,7 +84,9 @@ def convergence_basin(
         points = scan.points[(ranges >= probe.min_range_m) & (ranges <= probe.max_range_m)]
         prepared = backend.prepare(points, None)
         if i and i % probe.every == 0:
-            successes += _successes(backend, prepared.points[prepared.is_query], T_true[i], T_error, probe)
+            normals = backend.normals(prepared.points, prepared.is_query)
+            queries = prepared.points[prepared.is_query]
+            successes += _successes(backend, queries, normals, T_true[i], T_error, probe)
             scans += 1
         backend.local_map.update(prepared.points, T_true[i])
         advance()
@@ -128,7 +130,12 @@ def basin_figures(title: str, basins: Mapping[str, Basin]) -> Iterator[tuple[str
 
 
 def _successes(
-    backend: Backend, points: Tensor, T_true: Float[Tensor, "4 4"], T_error: Float[Tensor, "h 4 4"], probe: Probe
+    backend: Backend,
+    points: Tensor,
+    normals: Tensor | None,
+    T_true: Float[Tensor, "4 4"],
+    T_error: Float[Tensor, "h 4 4"],
+    probe: Probe,
 ) -> Float[Tensor, "h"]:
     """Which of the wrong initial poses lead to the true one."""
     found = []
@@ -138,7 +145,7 @@ def _successes(
             backend.local_map.association,
             (T_true @ T_some).to(points.device),
             backend.max_search_distance_m,
-            backend.normals(points),
+            normals,
         )
         xi = se3.log(se3.inverse(T_true) @ result.T_world_lidar.cpu())
         near = xi[:, :3].norm(dim=1) < probe.success_m

@@ -72,11 +72,15 @@ class Backend:
             T_world_previous: pose of the previous scan.
             surprise_m: how far points were displaced from where they were predicted in the last scans [m].
         """
-        queries = scan.deskewed(T_previous_new)[scan.is_query]
+        points = scan.deskewed(T_previous_new)
         distance = min(self.registration.search_distance_m + 2 * surprise_m, self.max_search_distance_m)
         T_world_new = T_world_previous @ T_previous_new
         return self.registration.register(
-            queries, self.local_map.association, T_world_new, distance, self.normals(queries)
+            points[scan.is_query],
+            self.local_map.association,
+            T_world_new,
+            distance,
+            self.normals(points, scan.is_query),
         )
 
     def best_hypothesis(
@@ -86,23 +90,23 @@ class Backend:
 
         The points are not deskewed: the guesses differ by more than the motion within a scan.
         """
-        queries = scan.points[scan.is_query]
+        queries = scan.is_query.nonzero()[:, 0]
         queries = queries[:: max(len(queries) // self.hypothesis_points, 1)]
         result = self.registration.register(
-            queries,
+            scan.points[queries],
             self.local_map.association,
             T_world_previous @ T_previous_new,
             self.max_search_distance_m,
-            self.normals(queries),
+            self.normals(scan.points, queries),
         )
         best = result.fit.argmax()
         return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar[best]))
 
-    def normals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"] | None:
-        """Normals of a new scan where the residual needs them, else None."""
+    def normals(self, points: Float[Tensor, "n 3"], chosen: Tensor) -> Float[Tensor, "m 3"] | None:
+        """Normals of some of a scan's points, from the neighbourhoods among all, where the residual needs them."""
         if not self.registration.residual.needs_normals:
             return None
-        return neighbourhood_normals(points, _NORMAL_VOXEL_M)
+        return neighbourhood_normals(points, _NORMAL_VOXEL_M)[chosen]
 
 
 def neighbourhood_normals(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Float[Tensor, "n 3"]:

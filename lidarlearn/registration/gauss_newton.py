@@ -27,8 +27,8 @@ class RegistrationResult:
         iterations: Gauss-Newton steps taken.
         converged: whether the last step was below the tolerances, at the final search distance.
         overlap: share of the points that have a map neighbour with a normal within the search distance.
-        inlier_share: share of those whose residual is below `inlier_residual_m`.
-        fit: mean over all points of exp(-(r / fit_residual_m)^2), 0 for those without a neighbour: sharper than the
+        inlier_share: share of those whose distance d from the map's surface is below `inlier_residual_m`.
+        fit: mean over all points of exp(-(d / fit_residual_m)^2), 0 for those without a neighbour: sharper than the
             inlier share, it tells the right pose from its neighbours.
         rmse_m: weighted root mean square of the residuals [m].
         hessian: of the weighted half squares by (translation [m], rotation [rad]) in the sensor's frame.
@@ -79,7 +79,7 @@ class GaussNewton:
         min_information: the position is left as initialized in directions of which the map says less than this, see
             `RegistrationResult.information`. Source: after Zhang, Kaess & Singh, "On degeneracy of optimization-based
             state estimation problems", ICRA 2016.
-        inlier_residual_m: a correspondence counts as an inlier below this residual [m].
+        inlier_residual_m: a correspondence counts as an inlier below this distance from the map's surface [m].
         fit_residual_m: scale of `RegistrationResult.fit` [m].
         translation_tolerance_m: converged when a step is shorter [m]...
         rotation_tolerance_deg: ...and turns by less [deg].
@@ -152,6 +152,8 @@ class GaussNewton:
         mask = (found.mask & (found.normals != 0).any(dim=-1)).view(points_world.shape[:-1])
         linear = self.residual.linearize(T, points, points_world, map_points, map_normals, normals)
         size = linear.residuals.norm(dim=-1)
+        # Whatever is minimized, a pose is judged by how far points are off the map's surface, not along it.
+        off = size if linear.residuals.shape[-1] == 1 else ((points_world - map_points) * map_normals).sum(-1).abs()
         widening = distance_m / self.search_distance_m  # a narrow kernel would hold on to whatever is near by chance
         squared_distances = (points_world - map_points).square().sum(-1)
         w = self.weight.weight(size / widening, squared_distances / widening**2) * mask
@@ -167,8 +169,8 @@ class GaussNewton:
             g=(wJ.mT @ linear.residuals.flatten(-2)[..., None].double())[..., 0],
             weight=w.sum(-1).double(),
             neighbours=mask.sum(-1),
-            inliers=(mask & (size < self.inlier_residual_m)).sum(-1),
-            fit=(mask * torch.exp(-((size / self.fit_residual_m) ** 2))).sum(-1),
+            inliers=(mask & (off < self.inlier_residual_m)).sum(-1),
+            fit=(mask * torch.exp(-((off / self.fit_residual_m) ** 2))).sum(-1),
             squares=(w * size * size).sum(-1).double(),
         )
 

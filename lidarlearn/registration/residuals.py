@@ -98,7 +98,8 @@ class GeneralizedIcp(Residual):
 
     Each point stands for a disc of unit variance along its surface and `epsilon` across it. With the whitening
     L of (C_q + R C_p R^T)^-1 = L L^T, scaled so that a plane met face to face gives the point-to-plane distance, the
-    squared residual is the Mahalanobis distance of Segal et al., "Generalized-ICP", RSS 2009.
+    squared residual is the Mahalanobis distance of Segal et al., "Generalized-ICP", RSS 2009. A new point without a
+    normal is taken to lie on the surface that it is matched with.
 
     Args:
         epsilon: variance across the surface over the variance along it.
@@ -120,7 +121,9 @@ class GeneralizedIcp(Residual):
         if normals is None:
             raise ValueError("generalized ICP needs the normals of the new scan")
         R = T_world_lidar[..., :3, :3].to(points.dtype)
-        covariance = self._disc(map_normals) + self._disc(normals @ R.mT)
+        own = normals @ R.mT
+        own = torch.where((own != 0).any(-1, keepdim=True), own, map_normals)  # unknown: the surface it is matched with
+        covariance = self._disc(map_normals) + self._disc(own)
         whitening = torch.linalg.cholesky(torch.linalg.inv(covariance)).mT * (2 * self.epsilon) ** 0.5
         r = (whitening @ (points_world - map_points)[..., None])[..., 0]
         return Linearization(r, whitening @ _point_jacobian(T_world_lidar, points))

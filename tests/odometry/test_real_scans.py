@@ -55,6 +55,22 @@ def test_kitti_04(real_data, association, mean_rpe_m, ape_m, record_property):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("association", "residual"), [("kd", "point_to_point"), *((name, "generalized_icp") for name in ASSOCIATIONS)]
+)
+def test_the_other_residuals_hold_on_kitti_04(real_data, association, residual, record_property):
+    sequence, scans = opened("kitti_00-08", real_data / "kitti_odometry", "04")
+    scans, true = scans[:12], sequence.T_world_lidar[:12]
+    name = f"{association}_f2m"
+    odometry = build(f"cv+{name}", f"residual@odometry.{name}.registration.residual={residual}")
+    frames = run(odometry, [scan.points for scan in scans])
+    translations, _ = motion_errors(poses(frames), true)
+    record_property("mean_rpe_m", translations.mean().item())
+    assert_no_failure(frames, true)
+    assert translations.mean() < 0.05 and translations[:3].max() < 0.1
+
+
+@pytest.mark.slow
 @all_associations
 def test_deskewing_kitti_raw_0009_lowers_the_error(real_data, association, record_property):
     sequence, scans = opened("kitti_raw", real_data / "kitti_raw", "2011_09_26_drive_0009")
