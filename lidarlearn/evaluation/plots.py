@@ -46,7 +46,7 @@ def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str
     paths = {method: _bird_eye(T_world) for method, T_world in T_estimates.items()}
     lower, upper = _view([*paths.values(), *([] if truth is None else [truth])], truth)
     width, height = (upper - lower).tolist()
-    figure = Figure(figsize=(7, 7 * height / width + 0.5), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(9, 7 * height / width + 0.5), dpi=_DPI, layout="constrained")
     axes = figure.add_subplot()
     if truth is not None:
         axes.plot(*truth.mT.numpy(), color=_TRUTH, linewidth=4, alpha=0.45, label="ground truth")
@@ -56,7 +56,7 @@ def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str
     axes.set_xlim(float(lower[0]), float(upper[0]))
     axes.set_ylim(float(lower[1]), float(upper[1]))
     axes.set_aspect("equal")
-    axes.legend(frameon=False)
+    _legend_beside(figure, axes)
     _finish(axes, title, "x, forward at the start [m]", "y, left at the start [m]")
     return figure
 
@@ -113,7 +113,7 @@ def speed_figure(title: str, true_kmh: Float[Tensor, "n"], estimated_kmh: Mappin
 
     Source: Dellenbach et al. 2021, IV-B, the figure on the distribution of the speed.
     """
-    figure = Figure(figsize=(7, 4), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(9, 4), dpi=_DPI, layout="constrained")
     axes = figure.add_subplot()
     everything = torch.cat([torch.zeros(0, dtype=torch.float64), *estimated_kmh.values()])
     edges = _speed_edges(true_kmh, everything)
@@ -122,7 +122,7 @@ def speed_figure(title: str, true_kmh: Float[Tensor, "n"], estimated_kmh: Mappin
     for i, (method, kmh) in enumerate(estimated_kmh.items()):
         _histogram(axes, kmh, edges, histtype="step", linewidth=1.5, label=method, **_line(i))
     axes.set_xlim(edges[0], edges[-1])
-    axes.legend(frameon=False)
+    _legend_beside(figure, axes)
     beyond = " (the last bin holds all beyond)" if len(everything) and float(everything.max()) > edges[-1] else ""
     _finish(axes, title, f"speed [km/h]{beyond}", f"share of scans [%] per {edges[1] - edges[0]:g} km/h")
     return figure
@@ -222,7 +222,7 @@ def _finish(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def _legend_beside(figure: Figure, axes: Axes) -> None:
-    """One legend for several axes that show the same methods, where it hides nothing."""
+    """A legend where it hides nothing; one for several axes that show the same methods."""
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
 
 

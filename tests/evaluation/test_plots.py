@@ -14,8 +14,8 @@ from lidarlearn.geometry import se3
 from lidarlearn.metrics.kitti import SegmentAverage
 
 
-def legend(axes_or_figure):
-    return [text.get_text() for text in axes_or_figure.get_legend().get_texts()]
+def legend(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_trajectories_start_together_to_the_same_scale(make_drive, longer):
@@ -24,7 +24,7 @@ def test_trajectories_start_together_to_the_same_scale(make_drive, longer):
     figure = trajectory_figure("a", truth, {"same": elsewhere, "longer": longer(truth, 0.1)})
     (axes,) = figure.axes
     assert axes.get_aspect() == 1
-    assert legend(axes) == ["ground truth", "same", "longer", "start"]
+    assert legend(figure) == ["ground truth", "same", "longer", "start"]
     assert "[m]" in axes.get_xlabel()
     assert "[m]" in axes.get_ylabel()
     true, same, far, _ = (torch.tensor(line.get_xydata()) for line in axes.lines)
@@ -42,8 +42,9 @@ def test_a_runaway_does_not_hide_the_rest(make_drive, longer):
 @pytest.mark.parametrize("frames", [1, 2])
 def test_trajectories_of_hardly_any_pose(make_drive, frames):
     T = make_drive(frames)
-    (axes,) = trajectory_figure("a", None, {"m": T}).axes
-    assert legend(axes) == ["m", "start"]
+    figure = trajectory_figure("a", None, {"m": T})
+    (axes,) = figure.axes
+    assert legend(figure) == ["m", "start"]
     assert axes.get_xlim()[0] < axes.get_xlim()[1]
 
 
@@ -102,3 +103,14 @@ def test_all_figures_of_an_evaluation_become_files(tmp_path, make_sequence, long
 def test_what_cannot_be_drawn_is_left_out(unknown_drive):
     drawn = dict(figures({"unknown": unknown_drive}, {"m": {"unknown": se3.identity(5)}}, []))
     assert list(drawn) == ["trajectories_unknown"]
+
+
+def test_groups_of_sequences_get_distributions_of_their_own(make_sequence, longer):
+    sequences = {"slow": make_sequence("slow", 50), "fast": make_sequence("fast", 50)}
+    sequences["fast"].T_world_lidar = longer(sequences["fast"].T_world_lidar, 2.0)
+    estimates = {"m": {name: s.T_world_lidar for name, s in sequences.items()}}
+    drawn = dict(figures(sequences, estimates, [], {"town, 30": ["slow"], "motorway": ["fast"]}))
+    edges = {name: figure.axes[0].get_xlim()[1] for name, figure in drawn.items() if name.startswith("speed")}
+    assert list(edges) == ["speed_distribution", "speed_distribution_town_30", "speed_distribution_motorway"]
+    assert edges["speed_distribution_town_30"] < 60 < edges["speed_distribution_motorway"]
+    assert drawn["speed_distribution_motorway"].axes[0].get_title(loc="left") == "motorway"
