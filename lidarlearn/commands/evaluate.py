@@ -209,9 +209,9 @@ def _report(run_folder: Path, protocol: dict[str, Any], evaluation: Evaluation, 
     scores, poses = evaluation.scores, evaluation.T_world_lidar
     write_report(run_folder, protocol, scores, trained_on, layout)
     groups = {} if layout is None else layout.columns
-    write_plots(run_folder / "plots", figures(evaluation.sequences, poses, scores, groups))
     with SummaryWriter(str(run_folder)) as writer:
         for name, figure in figures(evaluation.sequences, poses, scores, groups):
+            write_plots(run_folder / "plots", [(name, figure)])
             writer.add_figure(name, figure)
         writer.add_text("results", (run_folder / "results.md").read_text())
     print_tables(report_tables(protocol["data"], scores, trained_on, layout))

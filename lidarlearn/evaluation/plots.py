@@ -5,7 +5,7 @@ Figures are made without pyplot, whose list of open figures would grow with a tr
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from pathlib import Path
 from typing import Any
@@ -186,7 +186,7 @@ def figures(
             yield f"speed_distribution{suffix}", speed_figure(heading, true_kmh, estimated_kmh)
 
 
-def write_plots(folder: Path, named_figures: Iterator[tuple[str, Figure]]) -> list[Path]:
+def write_plots(folder: Path, named_figures: Iterable[tuple[str, Figure]]) -> list[Path]:
     """Write figures as PNG files.
 
     Args:

@@ -58,6 +58,12 @@ def call(monkeypatch, capsys, scans):
     return run
 
 
+@pytest.fixture
+def no_plots(monkeypatch):
+    """Drawing takes longer than everything else."""
+    monkeypatch.setattr(evaluate, "figures", lambda *_: iter(()))
+
+
 def results(folder):
     return json.loads((folder / "results.json").read_text())
 
@@ -66,7 +72,7 @@ def rows(folder):
     return {(row["method"], row["sequence"]): row for row in results(folder)["results"]}
 
 
-def test_a_run_is_taken_up_where_it_was_left(call, tmp_path):
+def test_a_run_is_taken_up_where_it_was_left(call, no_plots, tmp_path):
     run = f"hydra.run.dir={tmp_path}"
     call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']")
     before = (tmp_path / "trajectories/cv+p_f2m/0.txt").stat().st_mtime_ns
@@ -76,7 +82,7 @@ def test_a_run_is_taken_up_where_it_was_left(call, tmp_path):
     assert set(rows(tmp_path)) == {(m, s) for m in ("cv+p_f2m", "ni") for s in ("0", "1")}
 
 
-def test_a_run_with_other_settings_is_not_taken_for_this_one(call, tmp_path):
+def test_a_run_with_other_settings_is_not_taken_for_this_one(call, no_plots, tmp_path):
     run = f"hydra.run.dir={tmp_path}"
     call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']")
     printed = call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']", "odometry.p_f2m.local_map.size=2")
@@ -85,7 +91,7 @@ def test_a_run_with_other_settings_is_not_taken_for_this_one(call, tmp_path):
     assert settings["odometry"]["local_map"]["size"] == 2
 
 
-def test_an_export_that_was_cut_short_is_run_again(call, tmp_path):
+def test_an_export_that_was_cut_short_is_run_again(call, no_plots, tmp_path):
     run = f"hydra.run.dir={tmp_path}"
     call(run, "methods=[ni]", "data.test_sequences=['0']")
     (tmp_path / "trajectories/ni/0.json").unlink()
@@ -116,7 +122,7 @@ TABLE = (
 )
 
 
-def test_the_jobs_of_a_multirun_end_in_one_table(call, tmp_path):
+def test_the_jobs_of_a_multirun_end_in_one_table(call, no_plots, tmp_path):
     printed = call(
         "-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['1']", "methods=[ni],[cv+p_f2m]", TABLE
     )
@@ -129,7 +135,7 @@ def test_the_jobs_of_a_multirun_end_in_one_table(call, tmp_path):
     assert text.startswith("# Results\n\n### both") and "first" in printed
 
 
-def test_a_job_that_fails_leaves_the_others_their_table(call, tmp_path, capsys):
+def test_a_job_that_fails_leaves_the_others_their_table(call, no_plots, tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_:
         call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['7'],['1']", "methods=[ni]")
     assert exit_.value.code == 1
@@ -150,7 +156,7 @@ def test_jobs_run_in_parallel_processes(scans, tmp_path):
     assert [row["sequence"] for row in group["results"]] == ["0", "1"]
 
 
-def test_compare_prints_and_writes(call, tmp_path, monkeypatch, capsys):
+def test_compare_prints_and_writes(call, no_plots, tmp_path, monkeypatch, capsys):
     for name, size in (("a", 1), ("b", 2)):
         call(
             f"hydra.run.dir={tmp_path / name}", "methods=[cv+p_f2m]", "data.test_sequences=['0']",

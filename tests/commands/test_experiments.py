@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.evaluation.layout import TableLayout
@@ -55,12 +56,18 @@ def test_the_papers_settings_are_those_of_its_runs():
     assert config.odometry.kd_f2f.local_map.size == 1 and not config.pipeline.recovery
 
 
-@pytest.mark.parametrize("name", names("network"))
-def test_a_network_is_kept_where_the_tables_look_for_it(name):
-    config = composed("train", name)
-    assert config.hydra.run.dir == f"outputs/networks/{name.removeprefix('network/')}"
-    supervised = "supervised" in name
-    assert config.loss._target_.endswith("SupervisedLoss") == supervised
+def test_a_network_is_kept_where_the_tables_look_for_it():
+    for name in names("network"):
+        node = OmegaConf.load(FOLDER / f"{name}.yaml")
+        assert node.hydra.run.dir == f"outputs/networks/{name.removeprefix('network/')}"
+        options = [option for default in node.defaults for option in default.items()]
+        assert all((config_directory() / group.split()[-1].strip("/") / f"{o}.yaml").is_file() for group, o in options)
+        assert ({"override /loss": "supervised"} in node.defaults) == ("supervised" in name)
+
+
+@pytest.mark.parametrize("name", ["network/ford_campus", "network/simulated_mapping", "network/nclt_supervised"])
+def test_a_network_composes(name):
+    assert composed("train", name).hydra.run.dir.startswith("outputs/networks/")
 
 
 def test_the_test_server_gets_the_drives_without_public_poses():
