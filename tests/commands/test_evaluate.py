@@ -82,6 +82,7 @@ def test_a_run_is_taken_up_where_it_was_left(call, no_plots, tmp_path):
     assert set(rows(tmp_path)) == {(m, s) for m in ("cv+p_f2m", "ni") for s in ("0", "1")}
 
 
+@pytest.mark.slow
 def test_a_run_with_other_settings_is_not_taken_for_this_one(call, no_plots, tmp_path):
     run = f"hydra.run.dir={tmp_path}"
     call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']")
@@ -91,6 +92,7 @@ def test_a_run_with_other_settings_is_not_taken_for_this_one(call, no_plots, tmp
     assert settings["odometry"]["local_map"]["size"] == 2
 
 
+@pytest.mark.slow
 def test_an_export_that_was_cut_short_is_run_again(call, no_plots, tmp_path):
     run = f"hydra.run.dir={tmp_path}"
     call(run, "methods=[ni]", "data.test_sequences=['0']")

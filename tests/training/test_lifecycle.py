@@ -123,6 +123,7 @@ def test_resuming_with_another_model_says_so(run, tmp_path):
         train(config, data_name="boxes")
 
 
+@pytest.mark.slow
 def test_two_runs_from_one_seed_are_the_same(tmp_path):
     losses = []
     for name in ("a", "b"):
@@ -152,6 +153,7 @@ def test_without_validation_the_last_checkpoint_is_what_there_is(tmp_path):
     assert train(config, data_name="boxes").name == "last.ckpt"
 
 
+@pytest.mark.slow
 def test_a_part_of_the_validation_is_scored_as_far_as_it_goes(tmp_path):
     config = configured(
         tmp_path / "run", "trainer.max_epochs=1", "+trainer.limit_train_batches=1", "trainer.limit_val_batches=2",
@@ -161,6 +163,7 @@ def test_a_part_of_the_validation_is_scored_as_far_as_it_goes(tmp_path):
     assert curves(tmp_path / "run")["val/error"][0][1] > 0
 
 
+@pytest.mark.slow
 def test_an_image_that_scans_do_not_fill_is_told(tmp_path):
     config = configured(
         tmp_path / "run", "trainer.max_epochs=1", "datamodule.height=32", "datamodule.width=192", frames=9
@@ -169,6 +172,7 @@ def test_an_image_that_scans_do_not_fill_is_told(tmp_path):
         train(config, data_name="boxes")
 
 
+@pytest.mark.slow
 def test_bf16(tmp_path):
     config = configured(tmp_path / "run", "trainer.max_epochs=1", "trainer.precision=bf16-mixed", frames=9)
     train(config, data_name="boxes")

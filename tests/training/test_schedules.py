@@ -43,6 +43,7 @@ def test_a_longer_training_goes_on_by_its_own_number_of_steps():
     assert long.get_last_lr()[0] == pytest.approx(rates(6, total_steps=8, warm_up_share=0.0)[5] / 2)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
 def test_a_training_goes_through_it_step_by_step(tmp_path):
     from lidarlearn.commands.train import train
