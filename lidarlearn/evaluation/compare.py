@@ -177,10 +177,16 @@ def _labelled(runs: Series[Run]) -> list[Score]:
 
 
 def _variation(settings: Settings, variants: Series[Settings]) -> str:
-    """Those settings that differ between the variants, in brackets."""
-    known = dict.fromkeys(key for variant in variants for key in variant)
+    """Those settings that differ between the variants, in brackets, by the last words of their names where these do.
+
+    The sensor's projection belongs to the data.
+    """
+    known = dict.fromkeys(key for variant in variants for key in variant if "projection" not in key.split("."))
     keys = [key for key in known if len({repr(variant.get(key)) for variant in variants}) > 1]
-    return f" [{', '.join(f'{key}={settings.get(key)}' for key in keys)}]" if keys else ""
+    last = [key.rpartition(".")[2] for key in keys]
+    names = [short if last.count(short) == 1 else key for key, short in zip(keys, last, strict=True)]
+    values = [f"{name}={settings.get(key)}" for name, key in zip(names, keys, strict=True)]
+    return f" [{', '.join(values)}]" if values else ""
 
 
 def _flat(settings: Any, prefix: str = "") -> Settings:

@@ -168,7 +168,7 @@ def test_compare_prints_and_writes(call, no_plots, tmp_path, monkeypatch, capsys
     monkeypatch.setattr(sys, "argv", ["x", "compare", *folders, "--output", str(tmp_path / "both")])
     evaluation.main()
     printed = capsys.readouterr().out
-    assert "odometry.local_map.size=1" in printed and "size=2" in printed
+    assert "[size=1]" in printed and "[size=2]" in printed
     assert (tmp_path / "both" / "results.md").is_file()
     shutil.rmtree(tmp_path / "a")
     with pytest.raises(SystemExit) as exit_:

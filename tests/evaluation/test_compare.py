@@ -59,10 +59,22 @@ def test_the_same_method_with_other_settings_says_which(make_run):
     first = make_run("1", "m", "a", settings={"odometry": {"local_map": {"size": 30}, "same": 1}})
     second = make_run("2", "m", "a", settings={"odometry": {"local_map": {"size": 20}, "same": 1}})
     (group,) = groups(first, second)
-    assert [row.method for row in group.scores] == [
-        "m [odometry.local_map.size=30]",
-        "m [odometry.local_map.size=20]",
+    assert [row.method for row in group.scores] == ["m [size=30]", "m [size=20]"]
+
+
+def test_settings_of_one_name_are_told_apart_by_the_whole_of_it(make_run):
+    first = make_run("1", "m", "a", settings={"a": {"size": 1}, "b": {"size": 5}})
+    second = make_run("2", "m", "a", settings={"a": {"size": 2}, "b": {"size": 6}})
+    (group,) = groups(first, second)
+    assert [row.method for row in group.scores] == ["m [a.size=1, b.size=5]", "m [a.size=2, b.size=6]"]
+
+
+def test_the_sensor_of_the_data_is_no_setting_of_the_method(make_run):
+    runs = [
+        make_run(s, "m", s, settings={"sampling": {"projection": {"height": h}}}) for s, h in (("a", 64), ("b", 32))
     ]
+    (group,) = groups(*runs)
+    assert methods(group) == [("m", "a"), ("m", "b")]
 
 
 def test_a_run_that_was_repeated_keeps_both_rows(make_run):
