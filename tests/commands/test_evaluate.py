@@ -158,6 +158,7 @@ def test_jobs_run_in_parallel_processes(scans, tmp_path):
     assert [row["sequence"] for row in group["results"]] == ["0", "1"]
 
 
+@pytest.mark.slow
 def test_compare_prints_and_writes(call, no_plots, tmp_path, monkeypatch, capsys):
     for name, size in (("a", 1), ("b", 2)):
         call(

@@ -40,6 +40,7 @@ def test_same_seed_same_bytes_in_any_order(urban):
     assert torch.equal(again.T_world_lidar, urban.T_world_lidar)
 
 
+@pytest.mark.slow
 def test_other_seeds_give_other_worlds_and_other_ways(urban):
     other = Drive("urban", seed=4, frames=30, sensor=SENSOR)
     assert (other.ranges(0) != urban.ranges(0)).mean() > 0.5
@@ -66,6 +67,7 @@ def test_constant_speed_from_the_first_frame(static):
     assert steps == pytest.approx(np.full(29, 1.2), rel=0.02)
 
 
+@pytest.mark.slow
 def test_consecutive_static_scans_overlap_under_the_ground_truth(static):
     T_0_2 = (se3.inverse(static.T_world_lidar[10]) @ static.T_world_lidar[12]).numpy()
     ref, new = (static.scan(i).points.double().numpy() for i in (10, 12))
@@ -83,6 +85,7 @@ def test_consecutive_static_scans_overlap_under_the_ground_truth(static):
     assert overlap(T_0_2) < 0.6 * overlap(np.eye(4))
 
 
+@pytest.mark.slow
 def test_a_static_drive_takes_the_way_of_the_lively_one_without_its_traffic(urban):
     quiet = Drive("urban", seed=3, frames=30, sensor=SENSOR, static=True)
     assert torch.equal(quiet.T_world_lidar, urban.T_world_lidar)

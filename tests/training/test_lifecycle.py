@@ -133,6 +133,7 @@ def test_two_runs_from_one_seed_are_the_same(tmp_path):
     assert losses[0] == losses[1]
 
 
+@pytest.mark.slow
 def test_without_ground_truth_the_loss_chooses_the_best(tmp_path):
     config = configured(tmp_path / "run", "trainer.max_epochs=1", frames=9, without_truth=["0", "2"])
     best = train(config, data_name="boxes")
