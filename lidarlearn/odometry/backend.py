@@ -43,15 +43,18 @@ class Backend:
         sampling: which points are used.
         local_map: the scans to register against.
         registration: how.
-        max_search_distance_m: widest search, at the start and when the motion surprises [m].
+        max_search_distance_m: widest search, when the motion surprises [m].
         hypothesis_points: points with which several initial poses are tried at once.
+        hypothesis_distance_m: search distance of each of them [m]. Wider than they are apart, so that none is missed;
+            not much wider, or projective association pulls all of them to rest on a motorway.
     """
 
     sampling: Sampling
     local_map: LocalMap
     registration: GaussNewton = field(default_factory=GaussNewton)
     max_search_distance_m: float = 3.0
-    hypothesis_points: int = 600
+    hypothesis_points: int = 2000
+    hypothesis_distance_m: float = 1.5
 
     def prepare(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None) -> PreparedScan:
         """Sample a scan."""
@@ -70,7 +73,7 @@ class Backend:
             scan: the new scan.
             T_previous_new: the guess.
             T_world_previous: pose of the previous scan.
-            surprise_m: how far points were displaced from where they were predicted in the last scans [m].
+            surprise_m: how far points may be from where the guess has them [m].
         """
         points = scan.deskewed(T_previous_new)
         distance = min(self.registration.search_distance_m + 2 * surprise_m, self.max_search_distance_m)
@@ -86,21 +89,35 @@ class Backend:
     def best_hypothesis(
         self, scan: PreparedScan, T_previous_new: Float[Tensor, "h 4 4"], T_world_previous: Tensor
     ) -> Tensor:
-        """The guess, among several, from which a few points of the scan come to fit the map best, once registered.
+        """The guess, among several, from which a few points of the scan come to agree with the map best.
 
         The points are not deskewed: the guesses differ by more than the motion within a scan.
         """
         queries = scan.is_query.nonzero()[:, 0]
-        queries = queries[:: max(len(queries) // self.hypothesis_points, 1)]
+        few = queries[:: max(len(queries) // self.hypothesis_points, 1)]
         result = self.registration.register(
-            scan.points[queries],
+            scan.points[few],
             self.local_map.association,
             T_world_previous @ T_previous_new,
-            self.max_search_distance_m,
-            self.normals(scan.points, queries),
+            self.hypothesis_distance_m,
+            self.normals(scan.points, few),
         )
-        best = result.fit.argmax()
+        best = self._agreement(scan.points, queries, result.T_world_lidar).argmax()
         return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar[best]))
+
+    def agreement(self, scan: PreparedScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:
+        """How well a motion agrees with the map, see `GaussNewton.agreement`."""
+        T_world_new = T_world_previous @ T_previous_new
+        return self._agreement(scan.deskewed(T_previous_new), scan.is_query, T_world_new).item()
+
+    def _agreement(self, points: Float[Tensor, "n 3"], chosen: Tensor, T_world_lidar: Tensor) -> Tensor:
+        return self.registration.agreement(
+            points[chosen],
+            self.local_map.association,
+            T_world_lidar,
+            self.hypothesis_distance_m,
+            self.normals(points, chosen),
+        )
 
     def normals(self, points: Float[Tensor, "n 3"], chosen: Tensor) -> Float[Tensor, "m 3"] | None:
         """Normals of some of a scan's points, from the neighbourhoods among all, where the residual needs them."""

@@ -17,6 +17,8 @@ from lidarlearn.odometry.judgement import Judgement, motion_difference
 from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
 from lidarlearn.registration.gauss_newton import RegistrationResult
 
+_SEARCHED_M = 0.5  # how far off a motion may be that was found among several
+
 
 class Odometry(ScanByScan):
     """Registers each scan, from an initial guess of its motion, against a local map of the scans before it.
@@ -72,7 +74,7 @@ class Odometry(ScanByScan):
             if self._frames == 1:
                 if self._recovery:
                     T_previous_new, source = self._search(scan, start_motions().to(self._device)), "start"
-                self._deskew_first(scan, T_previous_new)
+                self._deskew_first(scan, T_previous_new, source)
             health = self._advance(scan, T_previous_new, source)
         self._frames += 1
         return Frame(self._T_world_lidar.cpu(), health)
@@ -94,12 +96,12 @@ class Odometry(ScanByScan):
             self._coasting = 0
         return Health(self._frames, status=status, points=len(scan.points))
 
-    def _deskew_first(self, scan: PreparedScan, T_previous_new: Tensor) -> None:
+    def _deskew_first(self, scan: PreparedScan, T_previous_new: Tensor, source: str) -> None:
         """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the poses."""
         first, self._first = self._first, None
         if first is None or first.times is None or not self._has_enough_points(scan):
             return
-        result = self._register(scan, T_previous_new)
+        result = self._register(scan, T_previous_new, source)
         if self._judgement.accepts(result):
             self._backend.local_map.restart()
             self._backend.local_map.update(first.deskewed(self._motion_to(result.T_world_lidar)), self._T_world_lidar)
@@ -108,12 +110,12 @@ class Odometry(ScanByScan):
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
         if not self._has_enough_points(scan):
             return self._coast(Health(self._frames, initialization=source, points=len(scan.points), overlap=0.0))
-        result = self._register(scan, T_previous_new)
+        result = self._register(scan, T_previous_new, source)
         health = self._assess(scan, result, source)
         if self._recovery and source != "start" and self._is_doubtful(result, health):
             hypotheses = surprise_motions(T_previous_new, self._motion)
-            second = self._register(scan, self._search(scan, hypotheses))
-            if second.fit > result.fit:
+            second = self._register(scan, self._search(scan, hypotheses), "recovery")
+            if self._agreement(scan, second) > self._agreement(scan, result):
                 result, health = second, self._assess(scan, second, "recovery")
             health = replace(health, status="recovered")
         if not self._judgement.accepts(result):
@@ -129,9 +131,13 @@ class Odometry(ScanByScan):
         fits_as_before = result.fit.item() >= self._judgement.min_fit_share * max(self._fits, default=0.0)
         return health.implausible or not fits_as_before or not self._judgement.accepts(result)
 
-    def _register(self, scan: PreparedScan, T_previous_new: Tensor) -> RegistrationResult:
-        surprise = max(self._surprises_m, default=math.inf)
-        return self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise)
+    def _register(self, scan: PreparedScan, T_previous_new: Tensor, source: str) -> RegistrationResult:
+        is_searched = source in ("start", "recovery")
+        surprise_m = _SEARCHED_M if is_searched else max(self._surprises_m, default=math.inf)
+        return self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m)
+
+    def _agreement(self, scan: PreparedScan, result: RegistrationResult) -> float:
+        return self._backend.agreement(scan, self._motion_to(result.T_world_lidar), self._T_world_lidar)
 
     def _search(self, scan: PreparedScan, T_previous_new: Float[Tensor, "h 4 4"]) -> Tensor:
         return self._backend.best_hypothesis(scan, T_previous_new, self._T_world_lidar)

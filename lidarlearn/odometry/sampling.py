@@ -1,5 +1,6 @@
 """Which points of a scan go into the map, and which of those are registered."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -9,6 +10,29 @@ from torch import Tensor
 
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import grid_sample
+
+_DENSE_MAP_VOXEL_M, _DENSE_QUERY_VOXEL_M = 0.4, 1.0
+_DENSE_RANGE_M = 35.0  # up to here neighbouring beams are no farther apart than a voxel and span planes together
+
+
+def map_voxel_m(projection: SphericalProjection) -> float:
+    """Voxel edge for the map of a sensor [m]: the paper's 0.4 m for 64 beams, 0.8 m for 32, 1.2 m for 16.
+
+    On a finer grid the ground seen by few beams has hardly any normals, and pitch is not followed.
+
+    Args:
+        projection: the sensor's image, one row a beam.
+
+    Source: Dellenbach et al. 2021, IV-A, for the HDL-64.
+    """
+    beam_spacing = math.radians(projection.fov_up_deg - projection.fov_down_deg) / projection.height
+    return max(_DENSE_MAP_VOXEL_M, round(beam_spacing * _DENSE_RANGE_M, 1))
+
+
+def query_voxel_m(projection: SphericalProjection) -> float:
+    """Voxel edge for the points of a sensor that are registered [m]: 1 m for 64 beams, who has fewer can spare none."""
+    map_voxel = map_voxel_m(projection)
+    return _DENSE_QUERY_VOXEL_M if map_voxel == _DENSE_MAP_VOXEL_M else map_voxel
 
 
 @dataclass(frozen=True)

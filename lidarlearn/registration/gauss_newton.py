@@ -14,6 +14,7 @@ from lidarlearn.registration.weights import Proximity, RobustWeight
 # A residual notices a move of 1 m if it changes by more than this [m]: the sine of 17 deg, beyond the error of nearly
 # all normals.
 _NOTICEABLE = 0.3
+_FEW = 0.1  # share of the points below which neighbours are too few for what they say to be believed
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,29 @@ class GaussNewton:
         T = se3.orthonormalize(T)
         system = self._linearize(points, association, T, self.search_distance_m, normals)
         return _judge(T, iterations, converged, system, len(points))
+
+    def agreement(
+        self,
+        points: Float[Tensor, "n 3"],
+        association: Association,
+        T_world_lidar: Float[Tensor, "*batch 4 4"],
+        search_distance_m: float,
+        normals: Float[Tensor, "n 3"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        """How well poses far from each other agree with the map: the share of points that fit, of all with a neighbour.
+
+        Unlike `RegistrationResult.fit` it is not drawn to where most points have a neighbour. The rings of a scan on
+        the ground lie on those of the scan before when the sensor is taken to stand still, however fast it drives.
+
+        Args:
+            points: the new scan [m], in its own frame.
+            association: the map.
+            T_world_lidar: poses, float64.
+            search_distance_m: what is farther from the map says nothing [m]: wide enough to see what does not fit.
+            normals: as in `register`.
+        """
+        system = self._linearize(points, association, T_world_lidar, search_distance_m, normals)
+        return system.fit / (system.neighbours + _FEW * max(len(points), 1))
 
     def _linearize(
         self, points: Tensor, association: Association, T: Tensor, distance_m: float, normals: Tensor | None

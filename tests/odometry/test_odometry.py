@@ -64,6 +64,33 @@ def test_every_initialization_drives_every_backend(initialization, association):
     assert sources <= {initialization, "recovery"} | ({"cv"} if initialization == "ei" else set())
 
 
+@cache
+def first_scans(world: str, seed: int, scans: int) -> tuple[Drive, tuple[Tensor, ...]]:
+    drive = Drive(world, seed=seed, frames=220)
+    return drive, tuple(drive.scan(i).points for i in range(scans))
+
+
+@pytest.mark.parametrize("association", ["p", pytest.param("kd", marks=slow), pytest.param("vh", marks=slow)])
+def test_a_drive_that_begins_on_a_motorway_is_not_taken_to_stand_still(association):
+    """At 80 km/h the ground and the barriers of two scans look most alike at rest: the rings lie on each other."""
+    drive, scans = first_scans("highway", 7, 3)
+    T_world_lidar = drive.T_world_lidar[:3]
+    assert se3.relative(T_world_lidar)[0, 0, 3] > 2
+    frames = run(build(f"cv+{association}_f2m"), scans)
+    translations, _ = motion_errors(poses(frames), T_world_lidar)
+    assert translations.max() < 0.05
+
+
+@slow
+@pytest.mark.parametrize("association", ["kd", "vh"])
+def test_the_swinging_pitch_of_a_segway_is_followed_with_32_beams(association):
+    drive, scans = first_scans("segway", 7, 60)
+    T_world_lidar = drive.T_world_lidar[:60]
+    frames = run(build(f"cv+{association}_f2m", projection="hdl32_inverted"), scans)
+    translations, angles = motion_errors(poses(frames), T_world_lidar)
+    assert translations.max() < 0.08 and angles.mean() < 0.3
+
+
 @pytest.mark.parametrize("speed", [0.0, *(pytest.param(v, marks=slow) for v in (4.0, 12.0, 20.0)), 27.0])
 @kd_at_least
 def test_any_speed_is_found_at_the_start(association, speed):

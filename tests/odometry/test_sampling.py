@@ -3,7 +3,7 @@ import torch
 
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import voxel_cells
-from lidarlearn.odometry.sampling import GridSampling, ImageSampling
+from lidarlearn.odometry.sampling import GridSampling, ImageSampling, map_voxel_m, query_voxel_m
 
 IMAGE = SphericalProjection(64, 720, 3.0, -24.0)
 
@@ -20,6 +20,18 @@ def test_the_grid_holds_one_point_per_voxel_for_map_and_queries(points):
     for source, index, size in ((points, sampled.map_index, 0.4), (in_map, sampled.query_index, 1.0)):
         cells = voxel_cells(points[index], size)
         assert len(cells.unique(dim=0)) == len(cells) == len(voxel_cells(source, size).unique(dim=0))
+
+
+@pytest.mark.parametrize(("rows", "up", "down", "grid"), [(64, 3.0, -24.0, (0.4, 1.0)), (64, 21.6, -21.6, (0.4, 1.0))])
+def test_sensors_of_64_beams_use_the_grid_of_the_paper(rows, up, down, grid):
+    projection = SphericalProjection(rows, 720, up, down)
+    assert (map_voxel_m(projection), query_voxel_m(projection)) == grid
+
+
+@pytest.mark.parametrize(("rows", "up", "down"), [(32, 11.3, -31.3), (16, 16.0, -16.0)])
+def test_beams_far_apart_share_wider_voxels_and_every_point_of_the_map_is_registered(rows, up, down):
+    projection = SphericalProjection(rows, 720, up, down)
+    assert 0.4 < map_voxel_m(projection) <= query_voxel_m(projection) <= 1.2
 
 
 @pytest.mark.parametrize("sampling", [GridSampling(), ImageSampling(IMAGE), ImageSampling(IMAGE, max_queries=100)])
