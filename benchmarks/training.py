@@ -13,10 +13,9 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.train import build_module
 from lidarlearn.data.datamodule import OdometryDataModule
 from lidarlearn.data.pairs import Pair
-from lidarlearn.training.module import PoseNetModule
-from lidarlearn.training.parts import build
 
 _STEPS, _ROUNDS = 12, 5
 
@@ -24,12 +23,12 @@ _STEPS, _ROUNDS = 12, 5
 def main() -> None:
     """Print pairs per second of both ways and their ratio."""
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", [*sys.argv[1:], "run_dir=/nowhere"])
+        config = compose("train", ["scheduler=constant", *sys.argv[1:], "run_dir=/nowhere"])
     device = torch.device("cuda" if torch.cuda.is_available() and config.device != "cpu" else "cpu")
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     datamodule.prepare_data()
     datamodule.setup()
-    module = _module(config, datamodule).to(device).train()
+    module = build_module(config, datamodule, "benchmark").to(device).train()
     optimizer = module.configure_optimizers()["optimizer"]  # type: ignore[index, call-overload]
 
     def batches() -> Iterable[Pair]:
@@ -65,13 +64,6 @@ def main() -> None:
     ratio = statistics.median(m / c for c, m in zip(*seconds.values(), strict=True))
     p = datamodule.projection
     print(f"ratio {ratio:.3f} on {device}, batches of {datamodule.batch_size} pairs of {p.height}x{p.width} px")
-
-
-def _module(config, datamodule: OdometryDataModule) -> PoseNetModule:  # noqa: ANN001 - omegaconf's, as composed
-    parts = {name: dict(config[name]) for name in ("model", "loss", "optimizer", "scheduler")}
-    p = datamodule.projection
-    image = {"height": p.height, "width": p.width, "fov_up_deg": p.fov_up_deg, "fov_down_deg": p.fov_down_deg}
-    return build(dict(config.module), **parts, trained_on={"projection": image})
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from lidarlearn.evaluation.plots import curves_figure, write_plots
+from lidarlearn.evaluation.plots import Panel, curves_figure, write_plots
 
 _IMAGES = Path(__file__).parent / "images"
 _PANELS = {
@@ -20,9 +20,10 @@ _PANELS = {
 def main(runs: list[Path]) -> None:
     """Read the curves of all runs and draw them."""
     events = {run.name: EventAccumulator(str(run)).Reload() for run in runs}
-    panels = {what: {name: curve(e, tag) for name, e in events.items()} for what, tag in _PANELS.items()}
-    figure = curves_figure("validation drives", panels, "epoch")
-    write_plots(_IMAGES, iter([("training_curves", figure)]))
+    panels = [
+        Panel("epoch", what, {name: curve(e, tag) for name, e in events.items()}) for what, tag in _PANELS.items()
+    ]
+    write_plots(_IMAGES, [("training_curves", curves_figure("validation drives", panels))])
 
 
 def curve(events: EventAccumulator, tag: str) -> dict[float, float]:

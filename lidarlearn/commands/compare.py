@@ -47,7 +47,10 @@ class GatheredResults(Callback):
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         """Print the table."""
         folder = Path(config.hydra.sweep.dir)
-        compare(_finished(folder))
+        runs = _finished(folder)
+        if not runs:
+            return  # every job has said what failed
+        compare(runs)
         print(f"results: {folder / 'results.md'}")
 
 

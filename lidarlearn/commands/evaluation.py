@@ -16,7 +16,7 @@ from lidarlearn.commands.compare import compare
 from lidarlearn.commands.run_folder import write_run_description
 from lidarlearn.data.sequence import DataSet
 from lidarlearn.errors import UserError
-from lidarlearn.evaluation.convergence import basin_figures, basin_tables, convergence_basin
+from lidarlearn.evaluation.convergence import basin_figure, basin_tables, convergence_basin
 from lidarlearn.evaluation.plots import write_plots
 from lidarlearn.evaluation.report import print_tables
 
@@ -50,7 +50,7 @@ def measure_convergence(config: DictConfig) -> None:
         UserError: the data or a setting is not as it should be.
     """
     unknown = [name for name in config.backends if name not in config.odometry]
-    if unknown:
+    if unknown or not config.backends:
         raise UserError(f"backends={unknown}: choose among {', '.join(config.odometry)}")
     data: DataSet = instantiate(config.data)
     data.prepare()
@@ -69,7 +69,7 @@ def measure_convergence(config: DictConfig) -> None:
             progress.remove_task(task)
     (folder / "convergence.json").write_text(json.dumps({k: asdict(v) for k, v in basins.items()}, indent=2) + "\n")
     print_tables(basin_tables(basins))
-    (plot,) = write_plots(folder, basin_figures(f"sequence {sequence.name}", basins))
+    (plot,) = write_plots(folder, [("convergence", basin_figure(f"sequence {sequence.name}", basins))])
     print(f"results: {folder / 'convergence.json'}  plot: {plot}")
 
 

@@ -46,7 +46,7 @@ def train(config: DictConfig, data_name: str) -> Path:
     seed_everything(config.seed, workers=True, verbose=False)
     run_folder = Path(config.run_dir)
     datamodule: OdometryDataModule = instantiate(config.datamodule)
-    module = _module(config, datamodule, data_name)
+    module = build_module(config, datamodule, data_name)
     if config.ckpt is not None:
         _check_resumable(Path(config.ckpt), module, config.trainer.max_epochs)
     trainer: Trainer = instantiate(config.trainer)
@@ -74,8 +74,17 @@ def _train_and_say_what_next(config: DictConfig) -> None:
         print(f"next:       {evaluate_command(checkpoint)}")
 
 
-def _module(config: DictConfig, datamodule: OdometryDataModule, data_name: str) -> PoseNetModule:
-    """The module, from plain dicts, so that its checkpoint needs no config."""
+def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: str) -> PoseNetModule:
+    """The module to train, from plain dicts, so that its checkpoint needs no config.
+
+    Args:
+        config: composed from `configs/train.yaml`.
+        datamodule: of the same configuration.
+        data_name: choice of the group `data`.
+
+    Raises:
+        UserError: a part does not take its settings.
+    """
 
     def plain(node: str) -> dict[str, Any]:
         return OmegaConf.to_container(config[node], resolve=True)  # type: ignore[return-value]

@@ -1,7 +1,7 @@
 """How far off an initial pose may be for a registration to find the right one: basins of convergence."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass
 
@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from lidarlearn.data.sequence import Sequence
-from lidarlearn.evaluation.plots import curves_figure
+from lidarlearn.errors import UserError
+from lidarlearn.evaluation.plots import Panel, curves_figure
 from lidarlearn.evaluation.tables import Table
 from lidarlearn.geometry import se3
 from lidarlearn.odometry.backend import Backend
@@ -71,11 +72,13 @@ def convergence_basin(
         advance: called after each scan.
 
     Raises:
-        ValueError: the sequence has no ground truth, or too few scans to try one.
+        UserError: the sequence has no ground truth, or too few scans to try one.
     """
     T_true = sequence.T_world_lidar
-    if T_true is None or len(sequence) <= probe.every:
-        raise ValueError(f"sequence {sequence.name}: ground truth is needed, and more than {probe.every} scans")
+    if T_true is None:
+        raise UserError(f"sequence {sequence.name} has no ground truth, by which success is told: choose another")
+    if len(sequence) <= probe.every:
+        raise UserError(f"sequence {sequence.name} has {len(sequence)} scans: set probe.every to fewer")
     T_error = torch.cat([_shifts(probe), _turns(probe)])
     successes = torch.zeros(len(T_error))
     scans = 0
@@ -115,18 +118,20 @@ def basin_tables(basins: Mapping[str, Basin]) -> list[Table]:
     return tables
 
 
-def basin_figures(title: str, basins: Mapping[str, Basin]) -> Iterator[tuple[str, Figure]]:
+def basin_figure(title: str, basins: Mapping[str, Basin]) -> Figure:
     """Success over the initial error, one curve a backend."""
 
     def percent(shares: Mapping[float, float]) -> dict[float, float]:
         return {step: 100 * share for step, share in shares.items()}
 
     what = "registrations that succeed [%]"
-    panels = {
-        f"{what}\ninitial offset of the position [m]": {n: percent(b.by_offset_m) for n, b in basins.items()},
-        f"{what}\ninitial error of the yaw [deg]": {n: percent(b.by_angle_deg) for n, b in basins.items()},
-    }
-    yield "convergence", curves_figure(title, panels)
+    offsets = {name: percent(basin.by_offset_m) for name, basin in basins.items()}
+    angles = {name: percent(basin.by_angle_deg) for name, basin in basins.items()}
+    panels = [
+        Panel("initial offset of the position [m]", what, offsets),
+        Panel("initial error of the yaw [deg]", what, angles),
+    ]
+    return curves_figure(title, panels)
 
 
 def _successes(

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as Series
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -83,22 +84,24 @@ def drift_figure(title: str, averages: Mapping[str, Mapping[int, SegmentAverage]
     return figure
 
 
-def curves_figure(title: str, panels: Mapping[str, Mapping[str, Mapping[float, float]]], x: str = "") -> Figure:
-    """Curves side by side, with one legend.
+@dataclass(frozen=True)
+class Panel:
+    """Curves, y by x and by name, that share two axes of these labels."""
 
-    Args:
-        title: what is shown.
-        panels: curves by name, each y by x, by the label of the vertical axis.
-        x: label of the horizontal axis; a panel's own goes after a line break in its label.
-    """
+    x: str
+    y: str
+    curves: Mapping[str, Mapping[float, float]]
+
+
+def curves_figure(title: str, panels: Series[Panel]) -> Figure:
+    """Panels side by side, with one legend for the names that they share."""
     figure = Figure(figsize=(10, 4), dpi=_DPI, layout="constrained")
     row = figure.subplots(1, len(panels), squeeze=False)[0]
-    for k, (axes, (label, curves)) in enumerate(zip(row, panels.items(), strict=True)):
-        for i, (name, curve) in enumerate(curves.items()):
+    for k, (axes, panel) in enumerate(zip(row, panels, strict=True)):
+        for i, (name, curve) in enumerate(panel.curves.items()):
             axes.plot(list(curve), list(curve.values()), marker="o", markersize=4, label=name, **_line(i))
         axes.set_ylim(bottom=0)
-        y, _, own = label.partition("\n")
-        _finish(axes, title if k == 0 else "", own or x, y)
+        _finish(axes, title if k == 0 else "", panel.x, panel.y)
     _legend_beside(figure, row[0])
     return figure
 

@@ -146,6 +146,14 @@ def test_a_job_that_fails_leaves_the_others_their_table(call, no_plots, tmp_path
     assert [row["sequence"] for row in group["results"]] == ["0", "1"]
 
 
+def test_where_every_job_fails_each_says_why_and_no_table_is_missed(call, no_plots, tmp_path, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['7'],['8']", "methods=[ni]")
+    printed = capsys.readouterr()
+    assert exit_.value.code == 1 and "error: job 0: " in printed.err
+    assert "IndexError" not in printed.out + printed.err and not (tmp_path / "results.md").exists()
+
+
 @pytest.mark.slow
 def test_jobs_run_in_parallel_processes(scans, tmp_path):
     program = Path(__file__).parents[2] / "evaluate.py"
@@ -175,6 +183,16 @@ def test_compare_prints_and_writes(call, no_plots, tmp_path, monkeypatch, capsys
     with pytest.raises(SystemExit) as exit_:
         evaluation.main()
     assert exit_.value.code == 1 and "not the result of an evaluation" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("override", "remedy"), [("probe.every=100", "probe.every"), ("backends=[]", "p_f2m")])
+def test_a_basin_that_cannot_be_measured_is_refused(scans, tmp_path, monkeypatch, capsys, override, remedy):
+    own = ["data=folder", f"data.root={scans}", *SENSOR, "data.test_sequences=['0']", f"hydra.run.dir={tmp_path}"]
+    monkeypatch.setattr(sys, "argv", ["x", "convergence", *own, override])
+    with pytest.raises(SystemExit) as exit_:
+        evaluation.main()
+    error = capsys.readouterr().err
+    assert exit_.value.code == 1 and error.startswith("error: ") and remedy in error
 
 
 def test_basins_of_convergence_are_measured_and_drawn(scans, tmp_path, monkeypatch, capsys):
