@@ -12,13 +12,13 @@ from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import grid_sample
 
 _DENSE_MAP_VOXEL_M, _DENSE_QUERY_VOXEL_M = 0.4, 1.0
-_DENSE_RANGE_M = 35.0  # up to here neighbouring beams are no farther apart than a voxel and span planes together
+_DENSE_RANGE_M = 35.0  # up to here neighbouring beams are no farther apart than a voxel
 
 
 def map_voxel_m(projection: SphericalProjection) -> float:
     """Voxel edge for the map of a sensor [m]: the paper's 0.4 m for 64 beams, 0.8 m for 32, 1.2 m for 16.
 
-    On a finer grid the ground seen by few beams has hardly any normals, and pitch is not followed.
+    With 32 beams on a grid of 0.4 m the swinging pitch of a Segway is not followed.
 
     Args:
         projection: the sensor's image, one row a beam.
@@ -30,7 +30,11 @@ def map_voxel_m(projection: SphericalProjection) -> float:
 
 
 def query_voxel_m(projection: SphericalProjection) -> float:
-    """Voxel edge for the points of a sensor that are registered [m]: 1 m for 64 beams, who has fewer can spare none."""
+    """Voxel edge for the points of a sensor that are registered [m]: 1 m for 64 beams, as for the map with fewer.
+
+    Args:
+        projection: the sensor's image, one row a beam.
+    """
     map_voxel = map_voxel_m(projection)
     return _DENSE_QUERY_VOXEL_M if map_voxel == _DENSE_MAP_VOXEL_M else map_voxel
 
