@@ -1,28 +1,23 @@
 """Speed and accuracy of the frame-to-model odometries beside KISS-ICP's and small_gicp's, on the same scans.
 
 `python -m benchmarks.odometry [--quick] [--kitti FOLDER] [--json FILE]`, after `pip install kiss-icp small_gicp`. All
-run in turns, scan by scan in this process, with the scans in memory: files apart, everything counts. Without --kitti
-only the simulated drive is run; --quick looks whether all run on a few scans and ours are accurate, not at time.
+run in turns in this process, with the scans in memory: files apart, everything counts. Without --kitti only the
+simulated drive is run.
 """
 
-import argparse
-import json
-import platform
 import statistics
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_dir
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch import Tensor
 
+from benchmarks import report
+from benchmarks.report import column
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.data import compose_data_set
 from lidarlearn.commands.evaluate import build_odometry
@@ -41,15 +36,16 @@ Runner = Callable[[list[Tensor]], Tensor]  # scans to poses T_world_lidar
 class Row:
     """What one method did on one drive: errors, and scans per second also as a share of KISS-ICP's."""
 
-    drive: str
-    method: str
-    scans_per_second: float
-    ratio_to_kiss_icp: float
-    ape_rmse_m: float
-    mean_rpe_cm: float
+    drive: str = column("drive")
+    method: str = column("method")
+    scans_per_second: float = column("scans/s")
+    ratio_to_kiss_icp: float = column("of KISS-ICP's")
+    ape_rmse_m: float = column("APE RMSE [m]")
+    mean_rpe_cm: float = column("mean RPE [cm]")
+    gpu_memory_mib: float | None = column("GPU memory [MiB]")
 
 
-def runner(method: str, device: str) -> Runner:
+def runner(method: str, device: torch.device) -> Runner:
     """A method as `evaluate.py` builds it."""
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
         config = compose("evaluate", ["projection@data.projection=hdl64", f"device={device}"])
@@ -72,55 +68,35 @@ def drives(kitti: Path | None, scans: int) -> dict[str, tuple[list[Tensor], Tens
     return found  # type: ignore[return-value]
 
 
-def main() -> None:
-    """Run everything, print the table and, where asked for, write it as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--kitti", type=Path, help="folder of KITTI odometry with sequence 04")
-    parser.add_argument("--json", type=Path, help="file to write the table to")
-    parser.add_argument("--quick", action="store_true", help="a few scans, once: for correctness, not for time")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="of our methods")
-    options = parser.parse_args()
+def measure(options: report.Options) -> list[Row]:
+    """Every method on every drive, medians over the rounds."""
     scans, rounds = (8, 1) if options.quick else (50, 5)
     runners = {method: runner(method, options.device) for method in (*BASELINES, *METHODS)}
     rows = []
     for name, (points, true) in drives(options.kitti, scans).items():
         seconds: dict[str, list[float]] = {method: [] for method in runners}
+        memory: dict[str, float | None] = dict.fromkeys(runners)
         poses = {}
         for _ in track(range(rounds), name):
             for method, run in runners.items():
+                if options.device.type == "cuda":
+                    torch.cuda.reset_peak_memory_stats()
                 start = time.perf_counter()
                 poses[method] = run(points)
                 seconds[method].append(time.perf_counter() - start)
+                if options.device.type == "cuda" and method in METHODS:
+                    memory[method] = torch.cuda.max_memory_allocated() / 2**20
         for method in runners:
             pace = statistics.median(k / s for k, s in zip(seconds["kiss_icp"], seconds[method], strict=True))
             rpe_cm = 100 * float(relative_errors(poses[method], true).translation.mean())
             per_second = len(points) / statistics.median(seconds[method])
-            rows.append(Row(name, method, per_second, pace, float(ape_rmse(poses[method], true)), rpe_cm))
-    show(rows)
-    if options.json is not None:
-        about = {"platform": platform.platform(), "threads": torch.get_num_threads(), "device": options.device}
-        about |= {package: version(package) for package in ("torch", "kiss-icp", "small-gicp")}
-        options.json.write_text(json.dumps({"about": about, "rows": [asdict(row) for row in rows]}, indent=2))
-    wrong = [row for row in rows if row.method in METHODS and not row.mean_rpe_cm < _LARGEST_RPE_CM]
+            ape_m = float(ape_rmse(poses[method], true))
+            rows.append(Row(name, method, per_second, pace, ape_m, rpe_cm, memory[method]))
+    wrong = [f"{r.method} on {r.drive}" for r in rows if r.method in METHODS and not r.mean_rpe_cm < _LARGEST_RPE_CM]
     if wrong:
-        sys.exit(
-            f"error: mean RPE of {_LARGEST_RPE_CM} cm or more: {', '.join(f'{r.method} on {r.drive}' for r in wrong)}"
-        )
-
-
-def show(rows: list[Row]) -> None:
-    """The rows as a table."""
-    table = Table(title="frame-to-model odometries, files apart")
-    for heading in ("drive", "method"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("scans/s", "ratio", "APE [m]", "RPE [cm]"):
-        table.add_column(heading, justify="right")
-    for row in rows:
-        numbers = (f"{row.scans_per_second:.1f}", f"{row.ratio_to_kiss_icp:.2f}")
-        table.add_row(row.drive, row.method, *numbers, f"{row.ape_rmse_m:.3f}", f"{row.mean_rpe_cm:.2f}")
-    Console().print(table)
-    print("ratio: of scans/s to KISS-ICP's. APE: RMSE after alignment. RPE: mean over consecutive scans.")
+        raise report.BenchmarkError(f"mean RPE of {_LARGEST_RPE_CM} cm or more: {', '.join(wrong)}", rows)
+    return rows
 
 
 if __name__ == "__main__":
-    main()
+    report.main(__doc__, odometry=measure)

@@ -5,28 +5,42 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks import report
+from benchmarks.report import column
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.raycasting import RayCaster
 from lidarlearn.simulation.sensors import hdl64
 
-_SCANS = 50
+
+@dataclass(frozen=True)
+class Row:
+    """What a scan of so many rays costs, and how often the cost of bare ray casting that is."""
+
+    work: str = column("work")
+    rays: int = column("rays")
+    processor_ms: float = column("processor [ms]")
+    wall_ms: float = column("wall [ms]")
+    processor_ratio: float = column("processor ratio")
+    wall_ratio: float = column("wall ratio")
 
 
-def cpu_and_wall_ms(work: Callable[[int], object]) -> tuple[float, float]:
-    """Processor and wall time of one call [ms], mean over `_SCANS` calls, in as many threads as make a data set."""
+def cpu_and_wall_ms(work: Callable[[int], object], scans: int) -> tuple[float, float]:
+    """Processor and wall time of one call [ms], mean over all, in as many threads as make a data set."""
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
         wall, cpu = time.perf_counter(), time.process_time()
-        list(pool.map(work, range(_SCANS)))
-        return 1e3 * (time.process_time() - cpu) / _SCANS, 1e3 * (time.perf_counter() - wall) / _SCANS
+        list(pool.map(work, range(scans)))
+        return 1e3 * (time.process_time() - cpu) / scans, 1e3 * (time.perf_counter() - wall) / scans
 
 
-def main() -> None:
-    """Print a table."""
-    drive = Drive("urban", frames=_SCANS, sensor=hdl64(2000))
+def measure(options: report.Options) -> list[Row]:
+    """A drive through a town with an HDL-64 of 2,000 columns."""
+    scans = 10 if options.quick else 50
+    drive = Drive("urban", frames=scans, sensor=hdl64(2000))
     caster = RayCaster(drive.world.static)
     pose = drive.trajectory.at(np.zeros(1))
     directions = drive.sensor.directions(0, pose[:, :3, :3])
@@ -35,18 +49,15 @@ def main() -> None:
     drive.ranges(0)
     caster.cast(rays)
     with tempfile.TemporaryDirectory() as folder:
-        rows = {
-            "bare ray casting": cpu_and_wall_ms(lambda _: caster.cast(rays)),
-            "scan (motion, movers, noise, drop-out, writing)": cpu_and_wall_ms(
-                lambda i: np.save(Path(folder) / f"{i}.npy", drive.ranges(i))
+        times = {
+            "bare ray casting": cpu_and_wall_ms(lambda _: caster.cast(rays), scans),
+            "scan: motion, movers, noise, drop-out, writing": cpu_and_wall_ms(
+                lambda i: np.save(Path(folder) / f"{i}.npy", drive.ranges(i)), scans
             ),
         }
-    print(f"{len(rays)} rays, {len(drive.world.static.triangles)} triangles, {len(drive.world.movers)} movers")
-    for name, (cpu, wall) in rows.items():
-        print(f"{name:50s} {cpu:6.1f} ms processor {wall:6.1f} ms wall")
-    bare, scan = rows.values()
-    print(f"ratio {scan[0] / bare[0]:.2f} processor, {scan[1] / bare[1]:.2f} wall")
+    bare_cpu, bare_wall = times["bare ray casting"]
+    return [Row(work, len(rays), cpu, wall, cpu / bare_cpu, wall / bare_wall) for work, (cpu, wall) in times.items()]
 
 
 if __name__ == "__main__":
-    main()
+    report.main(__doc__, simulation=measure)

@@ -1,17 +1,22 @@
-"""What loading costs a training: steps fed from the vertex-map cache against the same steps on tensors in memory.
+"""What loading, projection and loss cost a training, compared with the network's bare steps on tensors in memory.
 
-`python -m benchmarks.training [KEY=VALUE ...]` takes the overrides of train.py; both ways are timed in turns.
+Three kinds of steps are timed in turns: as `train.py` does them, fed from the vertex-map cache; the same on batches in
+memory; and the network's forward and backward pass and the optimizer's step alone, for a loss that costs nothing.
 """
 
 import statistics
-import sys
+import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from benchmarks import report
+from benchmarks.report import column
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.train import build_module
 from lidarlearn.data.datamodule import OdometryDataModule
@@ -20,51 +25,86 @@ from lidarlearn.data.pairs import Pair
 _STEPS, _ROUNDS = 12, 5
 
 
-def main() -> None:
-    """Print pairs per second of both ways and their ratio."""
+@dataclass(frozen=True)
+class Row:
+    """Pairs per second from the cache, and as a share of those of the other kinds of steps."""
+
+    image: str = column("image")
+    batch: int = column("batch")
+    device: str = column("device")
+    pairs_per_second: float = column("from the cache [pairs/s]")
+    ratio_to_memory: float = column("of in memory")
+    ratio_to_bare_network: float = column("of the bare network's")
+
+
+def measure(options: report.Options) -> list[Row]:
+    """The default network of simulated drives and the paper's, on scans of a simulated town."""
+    frames = 60 if options.quick else 220
+    on_gpu = options.device.type == "cuda"
+    sizes = ((32, 360, 512), (64, 720, 256)) if on_gpu else ((32, 360, 16), (64, 720, 8))
+    with tempfile.TemporaryDirectory() as folder:
+        return [_measure(options, folder, frames, *size) for size in (sizes[:1] if options.quick else sizes)]
+
+
+def _measure(options: report.Options, folder: str, frames: int, height: int, width: int, batch_size: int) -> Row:
+    overrides = [f"data.root={folder}", "data.train_sequences=[urban_00,urban_01,urban_02]", "data.val_sequences=[]"]
+    overrides += [f"datamodule.cache_root={folder}/cache", "data.test_sequences=[]", f"data.frames={frames}"]
+    overrides += [f"datamodule.height={height}", f"datamodule.width={width}", f"datamodule.batch_size={batch_size}"]
+    if options.device.type == "cuda":
+        overrides.append("datamodule.num_workers=8")
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose("train", ["scheduler=constant", *sys.argv[1:], "run_dir=/nowhere"])
-    device = torch.device("cuda" if torch.cuda.is_available() and config.device != "cpu" else "cpu")
+        config = compose("train", ["scheduler=constant", *overrides, "run_dir=/nowhere"])
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     datamodule.prepare_data()
     datamodule.setup()
-    module = build_module(config, datamodule, "benchmark").to(device).train()
+    module = build_module(config, datamodule, "benchmark").to(options.device).train()
     optimizer = module.configure_optimizers()["optimizer"]  # type: ignore[index, call-overload]
 
-    def batches() -> Iterable[Pair]:
+    def autocast() -> AbstractContextManager[None]:
+        return torch.autocast(options.device.type, torch.bfloat16, enabled=options.device.type == "cuda")
+
+    def batches() -> Iterator[Pair]:
         while True:
             yield from datamodule.train_dataloader()
 
     def to_device(batch: Pair) -> Pair:
-        moved = {key: value.to(device, non_blocking=True) for key, value in batch.items()}  # type: ignore[attr-defined]
+        moved = {key: value.to(options.device, non_blocking=True) for key, value in batch.items()}  # type: ignore[attr-defined]
         return datamodule.on_after_batch_transfer(moved, 0)
 
-    def step(batch: Pair) -> None:
+    def step(batch: Pair, bare: bool = False) -> None:
         optimizer.zero_grad()
-        result = module.compute_loss(module(batch["reference"], batch["target"]), batch)
-        result.loss.backward()
+        with autocast():
+            parameters = module(batch["reference"], batch["target"])
+        loss = parameters.square().sum() if bare else module.compute_loss(parameters, batch).loss
+        loss.backward()
         optimizer.step()
 
-    stream = iter(batches())
+    stream = batches()
     resident = [to_device(next(stream)) for _ in range(_STEPS)]
-    for batch in resident[:3]:
-        step(batch)
-    seconds: dict[str, list[float]] = {"from the cache": [], "from memory": []}
-    for _ in range(_ROUNDS):
-        for name, times in seconds.items():
+    kinds: dict[str, Callable[[int], None]] = {
+        "cache": lambda _: step(to_device(next(stream))),
+        "memory": lambda i: step(resident[i]),
+        "bare": lambda i: step(resident[i], bare=True),
+    }
+    seconds: dict[str, list[float]] = {kind: [] for kind in kinds}
+    for i in range(3):
+        step(resident[i])
+    for _ in range(1 if options.quick else _ROUNDS):
+        for kind, run in kinds.items():
             start = time.perf_counter()
             for i in range(_STEPS):
-                step(to_device(next(stream)) if name == "from the cache" else resident[i])
-            if device.type == "cuda":
+                run(i)
+            if options.device.type == "cuda":
                 torch.cuda.synchronize()
-            times.append(time.perf_counter() - start)
-    pairs = _STEPS * datamodule.batch_size
-    for name, times in seconds.items():
-        print(f"{name:16s} {pairs / statistics.median(times):8.1f} pairs/s")
-    ratio = statistics.median(m / c for c, m in zip(*seconds.values(), strict=True))
-    p = datamodule.projection
-    print(f"ratio {ratio:.3f} on {device}, batches of {datamodule.batch_size} pairs of {p.height}x{p.width} px")
+            seconds[kind].append(time.perf_counter() - start)
+
+    def pace_of(kind: str) -> float:
+        return statistics.median(k / c for c, k in zip(seconds["cache"], seconds[kind], strict=True))
+
+    pairs_per_second = _STEPS * batch_size / statistics.median(seconds["cache"])
+    image = f"{height}x{width}"
+    return Row(image, batch_size, str(options.device), pairs_per_second, pace_of("memory"), pace_of("bare"))
 
 
 if __name__ == "__main__":
-    main()
+    report.main(__doc__, training=measure)

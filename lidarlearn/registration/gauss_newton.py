@@ -90,7 +90,7 @@ class GaussNewton:
 
     residual: Residual = field(default_factory=PointToPlane)
     weight: RobustWeight = field(default_factory=Proximity)
-    max_iterations: int = 30
+    max_iterations: int = 50
     search_distance_m: float = 0.5
     narrowing: float = 0.85
     coarse_stride: int = 4

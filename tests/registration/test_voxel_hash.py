@@ -32,15 +32,15 @@ def test_recall_is_full_within_one_voxel_edge(both, record_property):
     assert not (found.mask & ~exact.mask).any()
 
 
-@pytest.mark.parametrize("distance", [0.8, 1.6])
-def test_wider_searches_visit_more_rings(both, distance):
+@pytest.mark.parametrize("distance", [0.5, 0.8, 1.1, 1.6])
+def test_wider_searches_visit_more_voxels(both, distance):
     tree, table, queries = both
     generator = torch.Generator().manual_seed(1)
     queries = queries + distance / 3 * torch.randn(queries.shape, generator=generator)
     assert recall(tree.search(queries, distance), table.search(queries, distance)) >= 0.99
 
 
-def test_the_widest_search_finds_a_neighbour_wherever_four_rings_reach(both):
+def test_the_widest_search_finds_a_neighbour_wherever_four_edges_reach(both):
     tree, table, queries = both
     shifted = queries + torch.tensor([0.0, 0.0, 1.0])
     exact, found = tree.search(shifted, 3.0), table.search(shifted, 3.0)

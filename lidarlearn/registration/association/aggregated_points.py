@@ -5,6 +5,7 @@ else. A table maps voxels to points: a point lives for k scans, an occupied voxe
 """
 
 import itertools
+import math
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -78,16 +79,20 @@ class AggregatedPoints:
         same = (self._cells[index.clamp(min=0)] == cells).all(dim=-1)
         return torch.where(alive & same, index - self._start, -1)
 
-    def around(self, points_world: Float[Tensor, "m 3"], radius: int) -> Int[Tensor, "m c"]:
-        """Candidates for the neighbours of each point: what stands in the cube of 2 radius + 1 voxels around it.
+    def cells_across(self, reach_m: float) -> int:
+        """How many voxels a line of twice the reach can touch."""
+        return math.ceil(2 * reach_m / self.voxel_size_m) + 1
+
+    def around(self, points_world: Float[Tensor, "m 3"], reach_m: float) -> Int[Tensor, "m c"]:
+        """Candidates for the neighbours of each point: what stands in the voxels that a cube of +-reach touches.
 
         Returns:
             Indices into `points`. An empty voxel, or one whose slot another voxel took, gives a point from anywhere:
             distances tell them apart, which is cheaper than to compare voxels.
         """
-        cells = voxel_cells(points_world, self.voxel_size_m).int()
-        steps = torch.arange(-radius, radius + 1, dtype=torch.int32, device=self._device)
-        x, y, z = (_axis_slots(cells[:, axis, None] + steps, axis) for axis in range(3))
+        first = voxel_cells(points_world - reach_m, self.voxel_size_m).int()
+        steps = torch.arange(self.cells_across(reach_m), dtype=torch.int32, device=self._device)
+        x, y, z = (_axis_slots(first[:, axis, None] + steps, axis) for axis in range(3))
         slots = (x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]).flatten()
         index = self._table.index_select(0, slots).clamp(min=self._start) - self._start
         return index.view(len(points_world), len(steps) ** 3)

@@ -1,7 +1,5 @@
 """Nearest neighbours by looking into the voxels around a point."""
 
-import math
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -11,11 +9,11 @@ from lidarlearn.registration.association.aggregated_points import AggregatedPoin
 from lidarlearn.registration.association.base import Association, Correspondences, no_correspondences
 
 _CANDIDATES_AT_ONCE = 1 << 19  # bounds the memory of a wide search
-_MAX_RADIUS = 4  # cells; beyond, a search would visit more than 9^3 voxels per point
+_MAX_REACH = 4  # voxel edges; beyond, a search would visit more than 9^3 voxels per point
 
 
 class VoxelHash(Association):
-    """The nearest point among the voxels around the query: exact up to one voxel edge and beyond by whole rings.
+    """The nearest point among the voxels around the query: exact within the search distance, up to four voxel edges.
 
     Nothing is built per scan: the table of the aggregated map is the search structure. It runs on tensors alone, on
     the CPU and on CUDA.
@@ -46,19 +44,19 @@ class VoxelHash(Association):
         self._map.insert(se3.transform(T_world_lidar, points), frames)
 
     def search(self, points_world: Float[Tensor, "n 3"], max_distance_m: float) -> Correspondences:
-        """The nearest point of the voxels that the search distance reaches, up to four rings of them."""
+        """The nearest point of the voxels that the search distance reaches, up to four edges away."""
         if self.is_empty:
             return no_correspondences(points_world)
-        radius = min(math.ceil(max_distance_m / self._voxel_size_m), _MAX_RADIUS)
-        chunks = points_world.split(max(_CANDIDATES_AT_ONCE // (2 * radius + 1) ** 3, 1))
-        found = [self._nearest(chunk, radius) for chunk in chunks]
+        reach_m = min(max_distance_m, _MAX_REACH * self._voxel_size_m)
+        chunks = points_world.split(max(_CANDIDATES_AT_ONCE // self._map.cells_across(reach_m) ** 3, 1))
+        found = [self._nearest(chunk, reach_m) for chunk in chunks]
         index = torch.cat([i for i, _ in found])
         squared = torch.cat([s for _, s in found])
         return Correspondences(self._map.points[index], self._map.normals[index], squared <= max_distance_m**2)
 
-    def _nearest(self, points: Float[Tensor, "n 3"], radius: int) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+    def _nearest(self, points: Float[Tensor, "n 3"], reach_m: float) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
         """Index of the nearest candidate of each point, and its squared distance."""
-        candidates = self._map.around(points, radius)
+        candidates = self._map.around(points, reach_m)
         offsets = self._map.points.index_select(0, candidates.flatten()).view(*candidates.shape, 3) - points[:, None]
         best = offsets.square().sum(-1).min(dim=1)
         return candidates.gather(1, best.indices[:, None])[:, 0].long(), best.values

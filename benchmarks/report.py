@@ -1,0 +1,116 @@
+"""What all benchmarks share: options, the device, tables and the JSON file."""
+
+import argparse
+import json
+import platform
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+_PACKAGES = ("torch", "kiss-icp", "small-gicp", "open3d")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line says.
+
+    Args:
+        quick: a few rounds, for correctness, not for time.
+        kitti: folder of KITTI odometry with sequence 04; None goes without.
+        device: of our own methods and networks.
+    """
+
+    quick: bool
+    kitti: Path | None
+    device: torch.device
+
+
+Rows = Sequence[Any]  # of dataclasses, a `column` for each field; None where there is nothing to measure
+Benchmark = Callable[[Options], Rows]
+
+
+def column(heading: str) -> Any:
+    """A field of a row, with its heading in the table and its unit in brackets."""
+    return field(metadata={"heading": heading})
+
+
+def main(description: str | None, **benchmarks: Benchmark) -> None:
+    """Measure, print a table for each benchmark and, where asked for, write all as JSON.
+
+    A benchmark that fails does not take from the others what they measured; the exit code tells of it.
+    """
+    parser = argparse.ArgumentParser(description=(description or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="a few scans, once: for correctness, not for time")
+    parser.add_argument("--kitti", type=Path, help="folder of KITTI odometry with sequence 04")
+    parser.add_argument("--json", type=Path, help="file to write the tables to")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda")
+    arguments = parser.parse_args()
+    options = Options(arguments.quick, arguments.kitti, torch.device(arguments.device))
+    tables: dict[str, Any] = {}
+    failures = []
+    for name, measure in benchmarks.items():
+        try:
+            rows = measure(options)
+        except BenchmarkError as error:
+            rows = error.rows
+            failures.append(f"{name}: {error}")
+        show(name, rows)
+        tables[name] = [asdict(row) for row in rows]
+        if arguments.json is not None:
+            arguments.json.write_text(json.dumps({"about": about(options), **tables}, indent=2))
+    if failures:
+        sys.exit("error: " + "\n  ".join(failures))
+
+
+class BenchmarkError(Exception):
+    """What was measured is wrong, not merely slow.
+
+    Args:
+        problem: what is wrong.
+        rows: what was measured.
+    """
+
+    def __init__(self, problem: str, rows: Rows) -> None:
+        super().__init__(problem)
+        self.rows = rows
+
+
+def about(options: Options) -> dict[str, Any]:
+    """Where the figures come from."""
+    device = torch.cuda.get_device_name() if options.device.type == "cuda" else platform.processor() or "cpu"
+    found = {"python": platform.python_version(), "platform": platform.platform(), "device": device}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return {**found, "threads": torch.get_num_threads()}
+
+
+def show(title: str, rows: Rows) -> None:
+    """The rows as a table; columns without any value are left out."""
+    table = Table(title=title)
+    columns = [f for f in fields(rows[0]) if any(getattr(row, f.name) is not None for row in rows)] if rows else []
+    for f in columns:
+        table.add_column(
+            f.metadata["heading"], justify="left" if isinstance(getattr(rows[0], f.name), str) else "right"
+        )
+    for row in rows:
+        table.add_row(*(_cell(getattr(row, f.name)) for f in columns))
+    Console().print(table)
+
+
+def _cell(value: str | float | None) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        return value
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
