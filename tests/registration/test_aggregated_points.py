@@ -130,7 +130,7 @@ def test_compaction_keeps_points_normals_and_places():
         torch.testing.assert_close(small.normals, large.normals)
         cells = voxel_cells(points, VOXEL)
         assert torch.equal(small.lookup(cells), large.lookup(cells))
-    assert len(small._points) < len(large._points)
+    assert len(small._cells) < len(large._cells)
 
 
 def test_memory_is_bounded_by_the_window():
@@ -140,7 +140,7 @@ def test_memory_is_bounded_by_the_window():
     for points in wandering(400, n=120):
         cloud.insert(points, frames=5)
         most_living = max(most_living, len(cloud.points))
-    assert len(cloud._points) <= 2 * (most_living + 120)
+    assert len(cloud._cells) <= 2 * (most_living + 120)
 
 
 def test_planes_of_a_flat_floor_are_level():

@@ -1,7 +1,8 @@
 """The last k scans aggregated, one point per voxel, with normals that grow with the map.
 
 Points stand in the order in which they came, so forgetting the oldest scans moves the start of a slice and nothing
-else. A table maps voxels to points: a point lives for k scans, an occupied voxel takes no second one meanwhile.
+else. Their coordinates lie apart in memory, as distances to many of them want it. A table maps voxels to points: a point
+lives for k scans, an occupied voxel takes no second one meanwhile.
 """
 
 import itertools
@@ -48,7 +49,12 @@ class AggregatedPoints:
     @property
     def points(self) -> Float[Tensor, "n 3"]:
         """All points of the map [m], oldest first."""
-        return self._points[self._start : self._end]
+        return self.coordinates.mT
+
+    @property
+    def coordinates(self) -> Float[Tensor, "3 n"]:
+        """The same, each coordinate of all points in one piece."""
+        return self._coordinates[:, self._start : self._end]
 
     @property
     def normals(self) -> Float[Tensor, "n 3"]:
@@ -61,11 +67,11 @@ class AggregatedPoints:
         free = self.lookup(voxel_cells(points_world, self.voxel_size_m)) < 0
         points_world = points_world[free]
         points_world = points_world[grid_sample(points_world, self.voxel_size_m)]
-        if self._end + len(points_world) > len(self._points):
+        if self._end + len(points_world) > len(self._cells):
             self._compact(len(points_world))
         new = slice(self._end, self._end + len(points_world))
         cells = voxel_cells(points_world, self.voxel_size_m)
-        self._points[new] = points_world
+        self._coordinates[:, new] = points_world.mT
         self._cells[new] = cells
         self._table[_slots(cells)] = torch.arange(new.start, new.stop, dtype=torch.int32, device=self._device)
         self._frame_starts.append(self._end)
@@ -107,8 +113,7 @@ class AggregatedPoints:
         neighbours = self.lookup(self._cells[new][:, None] + self._offsets)
         row, column = (neighbours >= 0).nonzero(as_tuple=True)
         index = neighbours[row, column] + self._start
-        d = self._points[index] - self._points[new][row]
-        x, y, z = d.unbind(-1)
+        x, y, z = self._coordinates[:, index] - self._coordinates[:, new][:, row]
         ones = torch.ones_like(x)
         squares = (x * x, x * y, x * z, y * y, y * z, z * z)
         self._moments[new] = 0
@@ -133,10 +138,11 @@ class AggregatedPoints:
     def _compact(self, needed: int) -> None:
         """Move the living points to the front of buffers that hold at least twice their number."""
         living = slice(self._start, self._end)
-        old = (self._points[living], self._cells[living], self._moments[living], self._normals[living])
+        coordinates, rest = self.coordinates, (self._cells[living], self._moments[living], self._normals[living])
         count = self._end - self._start
-        self._reserve(max(2 * (count + needed), len(self._points)))
-        for buffer, content in zip((self._points, self._cells, self._moments, self._normals), old, strict=True):
+        self._reserve(max(2 * (count + needed), len(self._cells)))
+        self._coordinates[:, :count] = coordinates
+        for buffer, content in zip((self._cells, self._moments, self._normals), rest, strict=True):
             buffer[:count] = content
         self._table.fill_(-1)
         self._table[_slots(self._cells[:count])] = torch.arange(count, dtype=torch.int32, device=self._device)
@@ -144,7 +150,7 @@ class AggregatedPoints:
         self._start, self._end = 0, count
 
     def _reserve(self, capacity: int) -> None:
-        self._points = torch.empty(capacity, 3, device=self._device)
+        self._coordinates = torch.empty(3, capacity, device=self._device)
         self._cells = torch.empty(capacity, 3, dtype=torch.int64, device=self._device)
         self._moments = torch.empty(capacity, 10, device=self._device)
         self._normals = torch.empty(capacity, 3, device=self._device)

@@ -57,6 +57,9 @@ class VoxelHash(Association):
     def _nearest(self, points: Float[Tensor, "n 3"], reach_m: float) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
         """Index of the nearest candidate of each point, and its squared distance."""
         candidates = self._map.around(points, reach_m)
-        offsets = self._map.points.index_select(0, candidates.flatten()).view(*candidates.shape, 3) - points[:, None]
-        best = offsets.square().sum(-1).min(dim=1)
+        squared = torch.zeros_like(candidates, dtype=points.dtype)
+        for coordinate, queried in zip(self._map.coordinates, points.unbind(-1), strict=True):
+            offset = coordinate.index_select(0, candidates.flatten()).view_as(candidates) - queried[:, None]
+            squared.addcmul_(offset, offset)
+        best = squared.min(dim=1)
         return candidates.gather(1, best.indices[:, None])[:, 0].long(), best.values
