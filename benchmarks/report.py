@@ -101,7 +101,7 @@ def show(title: str, rows: Rows) -> None:
     columns = [f for f in fields(rows[0]) if any(getattr(row, f.name) is not None for row in rows)] if rows else []
     for f in columns:
         table.add_column(
-            f.metadata["heading"], justify="left" if isinstance(getattr(rows[0], f.name), str) else "right"
+            escape(f.metadata["heading"]), justify="left" if isinstance(getattr(rows[0], f.name), str) else "right"
         )
     for row in rows:
         table.add_row(*(_cell(getattr(row, f.name)) for f in columns))

@@ -1,8 +1,8 @@
 """The last k scans aggregated, one point per voxel, with normals that grow with the map.
 
 Points stand in the order in which they came, so forgetting the oldest scans moves the start of a slice and nothing
-else. Their coordinates lie apart in memory, as distances to many of them want it. A table maps voxels to points: a point
-lives for k scans, an occupied voxel takes no second one meanwhile.
+else. Their coordinates lie apart in memory: distances to many points are computed axis by axis. A table maps voxels to
+points: a point lives for k scans, an occupied voxel takes no second one meanwhile.
 """
 
 import itertools
