@@ -100,9 +100,8 @@ def show(title: str, rows: Rows) -> None:
     table = Table(title=title)
     columns = [f for f in fields(rows[0]) if any(getattr(row, f.name) is not None for row in rows)] if rows else []
     for f in columns:
-        table.add_column(
-            escape(f.metadata["heading"]), justify="left" if isinstance(getattr(rows[0], f.name), str) else "right"
-        )
+        is_text = isinstance(getattr(rows[0], f.name), str)
+        table.add_column(escape(f.metadata["heading"]), justify="left" if is_text else "right")
     for row in rows:
         table.add_row(*(_cell(getattr(row, f.name)) for f in columns))
     Console().print(table)

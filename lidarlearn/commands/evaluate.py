@@ -80,7 +80,7 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     methods = _methods(config)
     layout: TableLayout | None = instantiate(config.table, _convert_="all")
     data: DataSet = instantiate(config.data)
-    data.prepare()
+    data.prepare(data.test_sequences)
     sequences = {name: data.sequence(name) for name in data.test_sequences}
     if not sequences:
         raise UserError('data.test_sequences is empty\n  change: data.test_sequences=["..."]')

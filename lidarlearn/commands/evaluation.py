@@ -53,7 +53,7 @@ def measure_convergence(config: DictConfig) -> None:
     if unknown or not config.backends:
         raise UserError(f"backends={unknown}: choose among {', '.join(config.odometry)}")
     data: DataSet = instantiate(config.data)
-    data.prepare()
+    data.prepare(data.test_sequences)
     sequences = [data.sequence(name) for name in data.test_sequences]
     if len(sequences) != 1:
         raise UserError(f"data.test_sequences={list(data.test_sequences)}: one sequence is measured at a time")

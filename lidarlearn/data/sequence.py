@@ -1,7 +1,7 @@
 """The two interfaces behind which every data set stands: a `Sequence` of scans and the `DataSet` it belongs to."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -149,5 +149,9 @@ class DataSet(ABC):
     def check(self) -> LayoutReport:
         """Describe this copy without reading whole scans: found, missing, odd."""
 
-    def prepare(self) -> None:  # noqa: B027 - most data sets have nothing to do
-        """Make what can be made on the spot (simulated scans); called once, before any sequence is opened."""
+    def prepare(self, names: Iterable[str] | None = None) -> None:  # noqa: B027 - most data sets have nothing to do
+        """Make what can be made on the spot (simulated scans); called once, before any sequence is opened.
+
+        Args:
+            names: the sequences that will be opened; None for all of the data set's.
+        """

@@ -158,9 +158,9 @@ class SimulatedDataSet(DataSet):
             note(name, f"{made} of {frames} scans in {self.folder(drive)}" + ("" if made == frames else "; " + _SOURCE))
         return report
 
-    def prepare(self) -> None:
+    def prepare(self, names: Iterable[str] | None = None) -> None:
         """Make the scans that are missing, with a progress bar; safe when two processes do it, or one is killed."""
-        drives = [self._drive(name) for name in self._names()]
+        drives = [self._drive(name) for name in (self._names() if names is None else dict.fromkeys(names))]
         if not any(_missing(self.folder(drive), range(self._wanted(drive))) for drive in drives):
             return
         self.root.mkdir(parents=True, exist_ok=True)

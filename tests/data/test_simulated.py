@@ -65,6 +65,14 @@ def test_the_number_of_workers_changes_no_byte(made, tmp_path, workers):
     assert _bytes(other) == _bytes(made)
 
 
+def test_only_the_sequences_asked_for_are_made(tmp_path):
+    data_set = _data_set(tmp_path)
+    data_set.prepare(["urban_02"])
+    assert len(data_set.sequence("urban_02")) == 4
+    with pytest.raises(DataSetNotFoundError, match="urban_01"):
+        data_set.sequence("urban_01")
+
+
 def test_prepare_again_writes_nothing(made):
     files = sorted(made.root.rglob("*.npy"))
     before = [file.stat().st_mtime_ns for file in files]
