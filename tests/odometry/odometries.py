@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from functools import cache
 
+import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
@@ -12,10 +13,18 @@ from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.evaluate import build_odometry
 from lidarlearn.evaluation.methods import parse_method
 from lidarlearn.geometry import se3
-from lidarlearn.odometry.odometry import Frame, ScanByScan
+from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
+from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
+from lidarlearn.simulation.sensors import Sensor, hdl32, hdl64, os1_64, vlp16
 
 ASSOCIATIONS = ("kd", "vh", "p")
+slow = pytest.mark.slow
+kd_at_least = pytest.mark.parametrize("association", ["kd", *(pytest.param(a, marks=slow) for a in ("p", "vh"))])
+
+FRAMES = 13
+SMALL = hdl64(columns=512)
+SENSORS = {"hdl64": hdl64(columns=1024), "hdl32": hdl32(), "vlp16": vlp16(), "os1_64": os1_64()}
 
 
 def build(name: str, *overrides: str, projection: str = "hdl64") -> ScanByScan:
@@ -48,3 +57,16 @@ def motion_errors(estimated: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
 def scans_of(drive: Drive) -> list[Tensor]:
     """The points of all scans."""
     return [drive.scan(i).points for i in range(len(drive))]
+
+
+@cache
+def street(frames: int = FRAMES, step: float = 1.2, yaw_step: float = 0.0, sensor: Sensor = SMALL) -> Drive:
+    """A drive at constant speed, `step` metres a scan, through a street where nothing moves."""
+    path = scenes.straight_path(frames, step, yaw_step=yaw_step)
+    return Drive(scenes.street(), poses=path, frames=frames, sensor=sensor)
+
+
+@cache
+def scans() -> tuple[Tensor, ...]:
+    """The points of the scans of `street()`."""
+    return tuple(scans_of(street()))

@@ -1,0 +1,116 @@
+"""Scans that are empty, broken, repeated, missing or turned: flagged, survived, recovered from."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from tests.odometry.odometries import FRAMES, build, kd_at_least, motion_errors, poses, run, scans, slow, street
+
+AT = 5  # the frame that is disturbed
+
+
+def drive_with(disturbed: Tensor) -> list[Tensor]:
+    return [*scans()[:AT], disturbed, *scans()[AT + 1 :]]
+
+
+def assert_recovers(frames: list, true: Tensor, within: int = 3) -> None:
+    """Finite everywhere, flagged at the disturbance, and right again soon after: absolutely, not only in its motion."""
+    estimated = poses(frames)
+    assert torch.isfinite(estimated).all()
+    assert frames[AT].health.flagged
+    assert not any(frame.health.flagged for frame in frames[:AT])
+    assert not any(frame.health.flagged for frame in frames[AT + 1 + within :])
+    errors = se3.log(se3.inverse(true) @ estimated)
+    assert errors[AT + within :, :3].norm(dim=1).max() < 0.1
+    assert errors[AT + within :, 3:].norm(dim=1).rad2deg().max() < 0.5
+
+
+def not_finite(points: Tensor) -> Tensor:
+    bad = points.clone()
+    bad[::7] = math.nan
+    bad[1::7, 1] = math.inf
+    bad[2::7, 2] = -math.inf
+    return bad
+
+
+@kd_at_least
+@pytest.mark.parametrize(
+    "disturbed",
+    [
+        pytest.param(torch.zeros(0, 3), id="empty"),
+        pytest.param(scans()[AT][::3200][:10], id="10 points"),
+        pytest.param(torch.full((500, 3), math.nan), id="only nan", marks=slow),
+        pytest.param(torch.zeros(500, 3), id="only zeros", marks=slow),
+    ],
+)
+def test_a_scan_without_content_is_flagged_and_survived(association, disturbed):
+    frames = run(build(f"cv+{association}_f2m"), drive_with(disturbed))
+    assert_recovers(frames, street().T_world_lidar)
+    assert frames[AT].health.status == "coasted"
+
+
+@kd_at_least
+def test_points_that_are_not_finite_are_left_out(association):
+    frames = run(build(f"cv+{association}_f2m"), drive_with(not_finite(scans()[AT])))
+    translations, _ = motion_errors(poses(frames), street().T_world_lidar)
+    assert translations.max() < 0.03
+
+
+@kd_at_least
+def test_a_repeated_scan_is_flagged_and_recovered_from(association):
+    frames = run(build(f"cv+{association}_f2m"), drive_with(scans()[AT - 1]))
+    assert_recovers(frames, street().T_world_lidar)
+    moved = se3.inverse(frames[AT - 1].T_world_lidar) @ frames[AT].T_world_lidar
+    assert moved[:3, 3].norm() < 0.1
+
+
+@kd_at_least
+def test_a_dropped_scan_is_flagged_and_recovered_from(association):
+    kept = [i for i in range(FRAMES) if i != AT]
+    frames = run(build(f"cv+{association}_f2m"), [scans()[i] for i in kept])
+    assert_recovers(frames, street().T_world_lidar[kept])
+
+
+@kd_at_least
+def test_a_turn_by_20_degrees_from_one_scan_to_the_next_is_flagged_and_recovered_from(association):
+    T_straight_turned = se3.from_euler(torch.tensor([0, 0, 0, 0, 0, math.radians(20)], dtype=torch.float64))
+    turned = se3.transform(se3.inverse(T_straight_turned), scans()[AT])
+    frames = run(build(f"cv+{association}_f2m"), drive_with(turned))
+    assert_recovers(frames, street().T_world_lidar)
+    expected = street().T_world_lidar[AT] @ T_straight_turned
+    error = se3.inverse(expected) @ frames[AT].T_world_lidar
+    assert error[:3, 3].norm() < 0.1 and se3.rotation_angle(error).rad2deg() < 0.5
+
+
+@kd_at_least
+def test_a_world_turned_for_good_is_followed(association):
+    """From one frame on every scan is turned: the sensor was knocked."""
+    T_straight_turned = se3.from_euler(torch.tensor([0, 0, 0, 0, 0, math.radians(20)], dtype=torch.float64))
+    turned = [se3.transform(se3.inverse(T_straight_turned), points) for points in scans()[AT:]]
+    frames = run(build(f"cv+{association}_f2m"), [*scans()[:AT], *turned])
+    true = street().T_world_lidar.clone()
+    true[AT:] = true[AT:] @ T_straight_turned
+    assert_recovers(frames, true)
+
+
+@kd_at_least
+@pytest.mark.parametrize("lead", [pytest.param(1, marks=slow), 3])
+def test_a_drive_that_begins_with_empty_scans_starts_when_there_is_something_to_see(association, lead):
+    frames = run(build(f"cv+{association}_f2m"), [*[torch.zeros(0, 3)] * lead, *scans()[:6]])
+    assert torch.isfinite(poses(frames)).all()
+    translations, _ = motion_errors(poses(frames)[lead:], street().T_world_lidar[:6])
+    assert translations.max() < 0.03
+
+
+@kd_at_least
+def test_after_a_long_gap_a_new_map_is_begun_and_said_so(association):
+    gap = [torch.zeros(0, 3)] * 6
+    frames = run(build(f"cv+{association}_f2m"), [*scans()[:3], *gap, *scans()[9:]])
+    statuses = [frame.health.status for frame in frames]
+    assert statuses[3:8] == ["coasted"] * 5 and "restarted" in statuses[8:10]
+    assert torch.isfinite(poses(frames)).all()
+    translations, _ = motion_errors(poses(frames)[10:], street().T_world_lidar[10:])
+    assert translations.max() < 0.05
