@@ -13,7 +13,7 @@ from lidarlearn.odometry.sampling import Sampling
 from lidarlearn.registration.association.aggregated_points import AggregatedPoints
 from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
 
-_HYPOTHESIS_ITERATIONS = 10  # to the final search distance and a little further: the best one is registered again
+_HYPOTHESIS_ITERATIONS = 30  # enough to compare them: the best one is registered again
 _NORMAL_VOXEL_M = 0.4  # neighbourhoods for the normals of a new scan, which only generalized ICP needs
 
 
@@ -45,7 +45,7 @@ class Backend:
         local_map: the scans to register against.
         registration: how.
         max_search_distance_m: widest search, when the motion surprises [m].
-        hypothesis_points: points with which several initial poses are tried at once, and compared.
+        hypothesis_points: points with which several initial poses are tried at once.
         hypothesis_distance_m: search distance of each of them [m]. Wider than they are apart, so that none is missed;
             not much wider, or projective association pulls all of them to rest on a motorway.
     """
@@ -54,7 +54,7 @@ class Backend:
     local_map: LocalMap
     registration: GaussNewton = field(default_factory=GaussNewton)
     max_search_distance_m: float = 3.0
-    hypothesis_points: int = 1000
+    hypothesis_points: int = 2000
     hypothesis_distance_m: float = 1.5
 
     def prepare(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None) -> PreparedScan:
@@ -96,7 +96,7 @@ class Backend:
         """
         queries = scan.is_query.nonzero()[:, 0]
         few = queries[:: max(len(queries) // self.hypothesis_points, 1)]
-        quick = replace(self.registration, coarse_stride=1, max_iterations=_HYPOTHESIS_ITERATIONS)
+        quick = replace(self.registration, max_iterations=_HYPOTHESIS_ITERATIONS)
         result = quick.register(
             scan.points[few],
             self.local_map.association,
@@ -104,7 +104,7 @@ class Backend:
             self.hypothesis_distance_m,
             self.normals(scan.points, few),
         )
-        best = self._agreement(scan.points, few, result.T_world_lidar).argmax()
+        best = self._agreement(scan.points, queries, result.T_world_lidar).argmax()
         return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar[best]))
 
     def agreement(self, scan: PreparedScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:
