@@ -122,7 +122,7 @@ class GaussNewton:
         Returns:
             The result; with nothing to hold on to, the initial pose, not converged, with an overlap of 0.
         """
-        T = T_world_lidar
+        T = T_world_lidar.clone()
         converged = torch.zeros(T.shape[:-2], dtype=torch.bool, device=T.device)
         distance, iterations = search_distance_m, 0
         while iterations < self.max_iterations:
@@ -131,11 +131,12 @@ class GaussNewton:
             stride = 1 if final else self.coarse_stride
             used_normals = None if normals is None else normals[::stride]
             distance = max(distance, self.search_distance_m)
-            system = self._linearize(points[::stride], association, T, distance, used_normals)
+            moving = ~converged
+            system = self._linearize(points[::stride], association, T[moving], distance, used_normals)
             step = self._solve(system)
-            T = T @ se3.exp(step)
+            T[moving] = T[moving] @ se3.exp(step)
             if final:
-                converged = self._is_small(step) & (system.weight > 0)
+                converged[moving] = self._is_small(step) & (system.weight > 0)
                 if converged.all():
                     break
             distance *= self.narrowing
