@@ -104,7 +104,7 @@ class Backend:
             self.hypothesis_distance_m,
             self.normals(scan.points, few),
         )
-        best = self._agreement(scan.points, queries, result.T_world_lidar).argmax()
+        best = self._agreement(scan.points, few, result.T_world_lidar).argmax()
         return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar[best]))
 
     def agreement(self, scan: PreparedScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:

@@ -131,7 +131,7 @@ class GaussNewton:
             stride = 1 if final else self.coarse_stride
             used_normals = None if normals is None else normals[::stride]
             distance = max(distance, self.search_distance_m)
-            moving = ~converged
+            moving = ~converged if converged.any() else ...  # all of them as they are: a mask would copy and batch one
             system = self._linearize(points[::stride], association, T[moving], distance, used_normals)
             step = self._solve(system)
             T[moving] = T[moving] @ se3.exp(step)
