@@ -45,7 +45,7 @@ class Backend:
         local_map: the scans to register against.
         registration: how.
         max_search_distance_m: widest search, when the motion surprises [m].
-        hypothesis_points: points with which several initial poses are tried at once.
+        hypothesis_points: points with which several initial poses are tried at once, and compared.
         hypothesis_distance_m: search distance of each of them [m]. Wider than they are apart, so that none is missed;
             not much wider, or projective association pulls all of them to rest on a motorway.
     """
