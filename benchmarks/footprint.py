@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks import report
+from benchmarks.odometry import METHODS
 from benchmarks.report import column
 from lidarlearn.commands.data import compose_data_set
 
 _DRIVE = "urban_07"
-_METHODS = ("cv+kd_f2m", "cv+vh_f2m", "cv+p_f2m")
 _EVALUATE = Path(__file__).parents[1] / "evaluate.py"
 _UNTIL_FIRST_SCAN = f"""
 import os, runpy
@@ -21,7 +21,7 @@ import lidarlearn.odometry.odometry as odometry
 odometry.Odometry.register_scan = lambda *_: os._exit(0)
 runpy.run_path({str(_EVALUATE)!r}, run_name="__main__")
 """
-# The kernel's peak of this very program: what a process reports to its parent begins with the parent's own memory.
+# Linux's own count for this very program: what a process reports to its parent begins with the parent's own memory.
 _WITH_PEAK = f"""
 import runpy
 try:
@@ -47,14 +47,14 @@ def measure(options: report.Options) -> list[Row]:
         data = ["data=simulated_urban", f"data.root={folder}", f"data.frames={frames}"]
         compose_data_set(data).prepare([_DRIVE])
         data += [f"data.test_sequences=[{_DRIVE}]", f"device={options.device}"]
-        start = ["-c", _UNTIL_FIRST_SCAN, *data, f"methods=[{_METHODS[0]}]", f"hydra.run.dir={folder}/start"]
+        start = ["-c", _UNTIL_FIRST_SCAN, *data, f"methods=[{METHODS[0]}]", f"hydra.run.dir={folder}/start"]
         rows = [
             Row("import torch", _median_seconds(["-c", "import torch"], options), None),
             Row("import torch, lidarlearn", _median_seconds(["-c", "import torch, lidarlearn"], options), None),
             Row("import lidarlearn.odometry", _median_seconds(["-c", "import lidarlearn.odometry"], options), None),
             Row("evaluate.py to its first scan", _median_seconds(start, options), None),
         ]
-        for method in _METHODS:
+        for method in METHODS:
             run = ["-c", _WITH_PEAK, *data, f"methods=[{method}]", f"hydra.run.dir={folder}/{method}"]
             seconds, output = _run(run)
             rows.append(Row(f"evaluate.py, {frames} scans, {method}", seconds, int(output.split()[-1]) / 2**10))

@@ -9,7 +9,7 @@ import torch
 
 from benchmarks import report
 from benchmarks.report import column
-from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.commands.data import compose_data_set
 from lidarlearn.models.posenet import PoseNet
 from lidarlearn.odometry.initialization.posenet import PoseNetInitialization
 from lidarlearn.odometry.scan_by_scan import InitializationAlone
@@ -34,7 +34,7 @@ def measure(options: report.Options) -> list[Row]:
     """A network with random weights; what it says does not change what it costs."""
     drive = Drive("urban", frames=4 if options.quick else 20, sensor=hdl64())
     scans = [scan.points for scan in drive]
-    projection = SphericalProjection(height=64, width=720, fov_up_deg=3.0, fov_down_deg=-24.0)
+    projection = compose_data_set(["data=simulated_urban"]).projection
     model = PoseNet().to(options.device).eval()
     network = TrainedNetwork(model, projection, options.device, trained_on={})
     image = f"{projection.height}x{projection.width}"

@@ -86,11 +86,15 @@ class AggregatedPoints:
         return torch.where(alive & same, index - self._start, -1)
 
     def cells_across(self, reach_m: float) -> int:
-        """How many voxels a line of twice the reach can touch."""
+        """How many voxels a line of twice the reach [m] can touch."""
         return math.ceil(2 * reach_m / self.voxel_size_m) + 1
 
     def around(self, points_world: Float[Tensor, "m 3"], reach_m: float) -> Int[Tensor, "m c"]:
         """Candidates for the neighbours of each point: what stands in the voxels that a cube of +-reach touches.
+
+        Args:
+            points_world: points [m], in the map's frame.
+            reach_m: nothing nearer than this is missed [m].
 
         Returns:
             Indices into `points`. An empty voxel, or one whose slot another voxel took, gives a point from anywhere:
