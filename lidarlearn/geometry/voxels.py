@@ -4,18 +4,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-_BITS = 21  # of each cell coordinate in a key: +-1,048,576 cells, 100 km at 0.1 m
-
 
 def voxel_cells(points: Float[Tensor, "*batch 3"], voxel_size_m: float) -> Int[Tensor, "*batch 3"]:
     """Integer coordinates of the voxel that holds each point."""
     return (points / voxel_size_m).floor().long()
 
 
-def voxel_keys(cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
-    """One integer per cell, different for different cells within +-2^20 of the origin."""
-    x, y, z = (cells + (1 << (_BITS - 1))).unbind(-1)
-    return (x << (2 * _BITS)) | (y << _BITS) | z
+def voxel_keys(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    """One integer per cell, different for different cells, of the fewest bits: sorting costs time for each of them."""
+    if len(cells) == 0:
+        return cells[:, 0]
+    cells = cells - cells.amin(dim=0)
+    nx, ny, nz = (cells.amax(dim=0) + 1).tolist()
+    keys = (cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]
+    return keys.int() if nx * ny * nz < 1 << 31 else keys
 
 
 def grid_sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor, "m"]:
@@ -30,7 +32,7 @@ def grid_sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor
     unique, inverse = torch.unique(keys, return_inverse=True)
     index = torch.arange(len(points), device=points.device)
     priority = (_hash(index) << 32) | index
-    drawn = torch.full_like(unique, torch.iinfo(torch.int64).max)
+    drawn = priority.new_full((len(unique),), torch.iinfo(torch.int64).max)
     drawn.scatter_reduce_(0, inverse, priority, "amin")
     return (drawn & 0xFFFFFFFF).sort().values
 

@@ -50,5 +50,5 @@ class Judgement:
 
 def motion_difference(T_a: Float[Tensor, "4 4"], T_b: Float[Tensor, "4 4"]) -> tuple[float, float]:
     """Distance [m] and angle [deg] between two motions."""
-    xi = se3.log(se3.inverse(T_a) @ T_b)
-    return xi[:3].norm().item(), math.degrees(xi[3:].norm().item())
+    T_a_b = se3.inverse(T_a) @ T_b
+    return T_a_b[:3, 3].norm().item(), math.degrees(se3.rotation_angle(T_a_b).item())

@@ -1,11 +1,9 @@
 """The local map: which registered scans the next one is registered against."""
 
-import math
-
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.geometry import se3
+from lidarlearn.odometry.judgement import motion_difference
 from lidarlearn.registration.association.base import Association
 
 
@@ -50,6 +48,5 @@ class LocalMap:
     def _is_key_frame(self, T_world_lidar: Float[Tensor, "4 4"]) -> bool:
         if self._T_world_key is None:
             return True
-        moved = se3.log(se3.inverse(self._T_world_key) @ T_world_lidar)
-        distance, angle = moved[:3].norm().item(), math.degrees(moved[3:].norm().item())
-        return distance >= self._key_frame_distance_m or angle >= self._key_frame_angle_deg
+        distance_m, angle_deg = motion_difference(self._T_world_key, T_world_lidar)
+        return distance_m >= self._key_frame_distance_m or angle_deg >= self._key_frame_angle_deg

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.registration.association.base import Association
+from lidarlearn.registration.association.base import Association, Neighbours
 from lidarlearn.registration.residuals import PointToPlane, Residual
 from lidarlearn.registration.weights import Proximity, RobustWeight
 
@@ -54,6 +54,7 @@ class RegistrationResult:
 class _System:
     """Normal equations H xi = -g of one iteration, and what they were made of."""
 
+    found: Neighbours | None
     jacobians: Float[Tensor, "*batch m 6"]
     weights: Float[Tensor, "*batch m"]
     H: Float[Tensor, "*batch 6 6"]
@@ -122,26 +123,25 @@ class GaussNewton:
         Returns:
             The result; with nothing to hold on to, the initial pose, not converged, with an overlap of 0.
         """
-        T = T_world_lidar.clone()
+        T = T_world_lidar
         converged = torch.zeros(T.shape[:-2], dtype=torch.bool, device=T.device)
-        distance, iterations = search_distance_m, 0
-        while iterations < self.max_iterations:
+        distance, iterations, found = search_distance_m, 0, None
+        while iterations < self.max_iterations and not converged.all():
             iterations += 1
             final = distance <= self.search_distance_m
             stride = 1 if final else self.coarse_stride
             used_normals = None if normals is None else normals[::stride]
             distance = max(distance, self.search_distance_m)
-            moving = ~converged if converged.any() else ...  # all of them as they are: a mask would copy and batch one
-            system = self._linearize(points[::stride], association, T[moving], distance, used_normals)
+            system = self._linearize(points[::stride], association, T, distance, used_normals, found)
+            found = system.found
             step = self._solve(system)
-            T[moving] = T[moving] @ se3.exp(step)
+            T = T @ se3.exp(torch.where(converged[..., None], 0.0, step))
             if final:
-                converged[moving] = self._is_small(step) & (system.weight > 0)
-                if converged.all():
-                    break
+                converged = converged | (self._is_small(step) & (system.weight > 0))
             distance *= self.narrowing
         T = se3.orthonormalize(T)
-        system = self._linearize(points, association, T, self.search_distance_m, normals)
+        if not converged.all():  # else the last system describes all of them, but for a small step
+            system = self._linearize(points, association, T, self.search_distance_m, normals, found)
         return _judge(T, iterations, converged, system, len(points))
 
     def agreement(
@@ -168,10 +168,16 @@ class GaussNewton:
         return system.fit / (system.neighbours + _FEW * max(len(points), 1))
 
     def _linearize(
-        self, points: Tensor, association: Association, T: Tensor, distance_m: float, normals: Tensor | None
+        self,
+        points: Tensor,
+        association: Association,
+        T: Tensor,
+        distance_m: float,
+        normals: Tensor | None,
+        last: Neighbours | None = None,
     ) -> _System:
         points_world = se3.transform(T, points)
-        found = association.search(points_world.reshape(-1, 3), distance_m)
+        found = association.search(points_world.reshape(-1, 3), distance_m, last)
         map_points = found.points.view_as(points_world)
         map_normals = found.normals.view_as(points_world)
         mask = (found.mask & (found.normals != 0).any(dim=-1)).view(points_world.shape[:-1])
@@ -188,6 +194,7 @@ class GaussNewton:
         J64 = J.double()
         wJ = J64 * weights[..., None]
         return _System(
+            found=found.neighbours,
             jacobians=J,
             weights=weights,
             H=wJ.mT @ J64,

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.registration.association.base import Association, Correspondences
+from lidarlearn.registration.association.base import Association, Correspondences, Neighbours
 from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
 from lidarlearn.registration.residuals import GeneralizedIcp, PointToPlane, PointToPoint
 from lidarlearn.registration.weights import Cauchy, CutOff, GemanMcClure, Huber, NoWeight, Proximity
@@ -177,11 +177,12 @@ class _Plane(Association):
     def clear(self) -> None:
         raise AssertionError("nothing to clear")
 
-    @property
-    def is_empty(self) -> bool:
-        return False
+    points = normals = torch.zeros(0, 3)
 
-    def search(self, points_world: Tensor, max_distance_m: float) -> Correspondences:
+    def nearest(self, points_world: Tensor, places: Tensor, max_distance_m: float) -> Neighbours:
+        raise AssertionError("no points to look up")
+
+    def search(self, points_world: Tensor, max_distance_m: float, last: Neighbours | None = None) -> Correspondences:
         feet = points_world * torch.tensor([1.0, 1.0, 0.0])
         up = torch.tensor([0.0, 0.0, 1.0]).expand_as(feet)
         return Correspondences(feet, up, points_world[:, 2].abs() <= max_distance_m)

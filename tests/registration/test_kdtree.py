@@ -45,37 +45,3 @@ def test_normals_belong_to_the_points_found():
     upright = found.mask & (found.normals != 0).any(dim=1) & ((found.points[:, 2] + 1.73).abs() < 0.1)
     assert upright.sum() > 10
     assert found.normals[upright, 2].abs().median() > 0.99
-
-
-@pytest.mark.parametrize("association", maps.ASSOCIATIONS)
-def test_a_cleared_map_is_empty_and_finds_nothing(association):
-    _, searchable = maps.make(association)
-    assert searchable.is_empty
-    searchable.insert(maps.drive("room").scan(0).points, se3.identity(), 30)
-    assert not searchable.is_empty
-    searchable.clear()
-    assert searchable.is_empty
-    assert not searchable.search(torch.randn(20, 3), 2.0).mask.any()
-
-
-@pytest.mark.parametrize("association", maps.ASSOCIATIONS)
-def test_an_empty_scan_adds_nothing_and_no_queries_find_nothing(association):
-    _, searchable = maps.make(association)
-    points = maps.drive("room").scan(0).points
-    searchable.insert(points, se3.identity(), 30)
-    queries = points[::50]
-    before = searchable.search(queries, 0.5)
-    searchable.insert(torch.zeros(0, 3), se3.identity(), 30)
-    after = searchable.search(queries, 0.5)
-    assert torch.equal(before.mask, after.mask) and torch.equal(before.points[before.mask], after.points[after.mask])
-    assert searchable.search(torch.zeros(0, 3), 0.5).points.shape == (0, 3)
-
-
-@pytest.mark.parametrize("association", maps.ASSOCIATIONS)
-def test_neighbours_are_within_the_search_distance(association):
-    scene = maps.scene("street", association)
-    queries = se3.transform(scene.T_world_lidar, scene.queries)
-    for distance in (0.1, 0.4, 1.0):
-        found = scene.association.search(queries, distance)
-        assert found.mask.any()
-        assert (found.points - queries)[found.mask].norm(dim=1).max() <= distance + 1e-5

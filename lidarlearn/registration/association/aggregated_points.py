@@ -5,8 +5,7 @@ else. Their coordinates lie apart in memory: distances to many points are comput
 points: a point lives for k scans, an occupied voxel takes no second one meanwhile.
 """
 
-import itertools
-import math
+import functools
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -39,8 +38,6 @@ class AggregatedPoints:
     def __init__(self, voxel_size_m: float, device: torch.device) -> None:
         self.voxel_size_m = voxel_size_m
         self._device = device
-        self._offsets = neighbourhood(1, device)
-        self._offsets = self._offsets[(self._offsets != 0).any(dim=1)]
         self._table = torch.full((1 << sum(_TABLE_BITS),), -1, dtype=torch.int32, device=device)
         self._reserve(1 << 16)
         self._start = self._end = 0
@@ -85,27 +82,29 @@ class AggregatedPoints:
         same = (self._cells[index.clamp(min=0)] == cells).all(dim=-1)
         return torch.where(alive & same, index - self._start, -1)
 
-    def cells_across(self, reach_m: float) -> int:
-        """How many voxels a line of twice the reach [m] can touch."""
-        return math.ceil(2 * reach_m / self.voxel_size_m) + 1
-
-    def around(self, points_world: Float[Tensor, "m 3"], reach_m: float) -> Int[Tensor, "m c"]:
-        """Candidates for the neighbours of each point: what stands in the voxels that a cube of +-reach touches.
+    def around(self, points_world: Float[Tensor, "m 3"], radius: int, inner: int = -1) -> Int[Tensor, "m c"]:
+        """Candidates for the neighbours of each point: what stands in the voxels up to so many steps from its own.
 
         Args:
             points_world: points [m], in the map's frame.
-            reach_m: nothing nearer than this is missed [m].
+            radius: how many steps along each axis.
+            inner: voxels up to this number of steps away are left out.
 
         Returns:
             Indices into `points`. An empty voxel, or one whose slot another voxel took, gives a point from anywhere:
             distances tell them apart, which is cheaper than to compare voxels.
         """
-        first = voxel_cells(points_world - reach_m, self.voxel_size_m).int()
-        steps = torch.arange(self.cells_across(reach_m), dtype=torch.int32, device=self._device)
-        x, y, z = (_axis_slots(first[:, axis, None] + steps, axis) for axis in range(3))
-        slots = (x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]).flatten()
-        index = self._table.index_select(0, slots).clamp(min=self._start) - self._start
-        return index.view(len(points_world), len(steps) ** 3)
+        cells = voxel_cells(points_world, self.voxel_size_m)
+        return self._candidates(cells, radius, inner).clamp(min=self._start) - self._start
+
+    def _candidates(self, cells: Int[Tensor, "m 3"], radius: int, inner: int = -1) -> Int[Tensor, "m c"]:
+        """What the table says of the voxels in a cube around each voxel, as `_cube` lists them."""
+        cells, steps = cells.int(), torch.arange(-radius, radius + 1, dtype=torch.int32, device=self._device)
+        x, y, z = (_axis_slots(cells[:, axis, None] + steps, axis) for axis in range(3))
+        slots = (x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]).flatten(1)
+        if inner >= 0:
+            slots = slots[:, _cube(radius, self._device).abs().amax(dim=1) > inner]
+        return self._table.index_select(0, slots.flatten()).view_as(slots)
 
     def _forget(self, frames: int) -> None:
         dropped = max(len(self._frame_starts) - frames, 0)
@@ -114,9 +113,13 @@ class AggregatedPoints:
 
     def _update_moments(self, new: slice) -> None:
         """Let the new points and their neighbours count each other, and refit the planes that changed."""
-        neighbours = self.lookup(self._cells[new][:, None] + self._offsets)
-        row, column = (neighbours >= 0).nonzero(as_tuple=True)
-        index = neighbours[row, column] + self._start
+        cells = self._cells[new]
+        index = self._candidates(cells, 1)
+        row, column = (index >= self._start).nonzero(as_tuple=True)
+        index = index[row, column].long()
+        offsets = self._cells[index] - cells[row]
+        near = (offsets.abs().amax(dim=1) <= 1) & (offsets != 0).any(dim=1)  # a slot may be another voxel's
+        row, index = row[near], index[near]
         x, y, z = self._coordinates[:, index] - self._coordinates[:, new][:, row]
         ones = torch.ones_like(x)
         squares = (x * x, x * y, x * z, y * y, y * z, z * z)
@@ -160,10 +163,11 @@ class AggregatedPoints:
         self._normals = torch.empty(capacity, 3, device=self._device)
 
 
-def neighbourhood(radius: int, device: torch.device) -> Int[Tensor, "n 3"]:
-    """Offsets of all cells of the cube of edge 2 radius + 1 around a cell, itself included."""
-    steps = range(-radius, radius + 1)
-    return torch.tensor(list(itertools.product(steps, steps, steps)), device=device)
+@functools.cache
+def _cube(radius: int, device: torch.device) -> Int[Tensor, "n 3"]:
+    """Offsets of all cells of the cube of edge 2 radius + 1 around a cell, itself included, z fastest."""
+    steps = torch.arange(-radius, radius + 1, device=device)
+    return torch.cartesian_prod(steps, steps, steps)
 
 
 def _is_plane(

@@ -4,8 +4,34 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """The nearest map point of each query, and what must have happened before it can be another.
+
+    Args:
+        queries: where each query was when its neighbour was looked up [m].
+        places: which part of the map was looked at, see `Association.places`.
+        index: the nearest point of that part, -1 where there is none.
+        others_m: all its other points were at least this far from the query [m].
+    """
+
+    queries: Float[Tensor, "n 3"]
+    places: Int[Tensor, "n"]
+    index: Int[Tensor, "n"]
+    others_m: Float[Tensor, "n"]
+
+    def replaced(self, which: Int[Tensor, "m"], by: "Neighbours") -> "Neighbours":
+        """A copy with some of them exchanged."""
+        return Neighbours(
+            self.queries.index_copy(0, which, by.queries),
+            self.places.index_copy(0, which, by.places),
+            self.index.index_copy(0, which, by.index),
+            self.others_m.index_copy(0, which, by.others_m),
+        )
 
 
 @dataclass(frozen=True)
@@ -16,17 +42,13 @@ class Correspondences:
         points: map points [m] in the map's frame; meaningless where `mask` is false.
         normals: unit normals of the map there; zero where undefined.
         mask: whether there is a neighbour within the search distance.
+        neighbours: what a search of the same points, moved a little, may start from.
     """
 
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]
     mask: Bool[Tensor, "n"]
-
-
-def no_correspondences(points: Float[Tensor, "n 3"]) -> Correspondences:
-    """What an empty map answers."""
-    zeros = torch.zeros_like(points)
-    return Correspondences(zeros, zeros, torch.zeros(len(points), dtype=torch.bool, device=points.device))
+    neighbours: Neighbours | None = None
 
 
 class Association(ABC):
@@ -46,14 +68,64 @@ class Association(ABC):
         """
 
     @abstractmethod
-    def search(self, points_world: Float[Tensor, "n 3"], max_distance_m: float) -> Correspondences:
-        """The neighbour of each point among the map's points, no farther than `max_distance_m`."""
-
-    @abstractmethod
     def clear(self) -> None:
         """Forget every scan."""
 
     @property
     @abstractmethod
+    def points(self) -> Float[Tensor, "m 3"]:
+        """All points of the map [m]."""
+
+    @property
+    @abstractmethod
+    def normals(self) -> Float[Tensor, "m 3"]:
+        """Their unit normals, zero where undefined."""
+
+    @property
     def is_empty(self) -> bool:
         """Whether there is nothing to search in."""
+        return len(self.points) == 0
+
+    def search(
+        self, points_world: Float[Tensor, "n 3"], max_distance_m: float, last: Neighbours | None = None
+    ) -> Correspondences:
+        """The neighbour of each point among the map's points, no farther than `max_distance_m`.
+
+        Args:
+            points_world: points [m], in the map's frame.
+            max_distance_m: farther points of the map are no neighbours [m].
+            last: what was found for the same points where they stood before, in the same map. It changes nothing but
+                the work: a point that moved by less than half the lead of its neighbour over all others keeps it.
+                Left aside if it is of another number of points.
+        """
+        if self.is_empty:
+            nothing = torch.zeros_like(points_world)
+            return Correspondences(nothing, nothing, torch.zeros_like(points_world[:, 0], dtype=torch.bool))
+        places = self.places(points_world)
+        if last is None or len(last.index) != len(points_world):
+            neighbours = self.nearest(points_world, places, max_distance_m)
+        else:
+            neighbours = self._followed(points_world, places, max_distance_m, last)
+        index = neighbours.index.clamp(min=0)
+        points = self.points[index]
+        within = (points - points_world).square().sum(dim=1) <= max_distance_m**2
+        return Correspondences(points, self.normals[index], within & (neighbours.index >= 0), neighbours)
+
+    def places(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+        """In which part of the map each point looks for its neighbour: everywhere, if not defined otherwise."""
+        return torch.zeros(len(points_world), dtype=torch.int64, device=points_world.device)
+
+    @abstractmethod
+    def nearest(
+        self, points_world: Float[Tensor, "n 3"], places: Int[Tensor, "n"], max_distance_m: float
+    ) -> Neighbours:
+        """Look up the nearest point of each point's place; farther ones than `max_distance_m` need not be found."""
+
+    def _followed(self, points_world: Tensor, places: Tensor, max_distance_m: float, last: Neighbours) -> Neighbours:
+        """Look up only what may have changed."""
+        moved = (points_world - last.queries).norm(dim=1)
+        distances = (self.points[last.index.clamp(min=0)] - points_world).norm(dim=1)
+        distances = torch.where(last.index < 0, max_distance_m, distances.clamp(max=max_distance_m))
+        stale = (distances > last.others_m - moved) | (places != last.places)
+        which = stale.nonzero()[:, 0]
+        return last.replaced(which, self.nearest(points_world[which], places[which], max_distance_m))

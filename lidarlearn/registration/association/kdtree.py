@@ -2,54 +2,54 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lidarlearn.geometry import se3
-from lidarlearn.registration.association.aggregated_points import AggregatedPoints
-from lidarlearn.registration.association.base import Association, Correspondences, no_correspondences
+from lidarlearn.registration.association.aggregated_map import AggregatedMap
+from lidarlearn.registration.association.base import Neighbours
+
+_MARGIN_M = 0.1  # searched beyond what is asked for: who finds nothing need not look again before he has moved so far
+_FEW = 1000  # queries that one thread has answered before others have started
+_LEAF_SIZE = 32  # points; smaller leaves take longer to build, and no less to search
 
 
-class KdTree(Association):
+class KdTree(AggregatedMap):
     """The nearest point of the aggregated map by a KdTree (scipy's), rebuilt once per inserted scan.
 
-    Args:
-        voxel_size_m: grid sampling of the map [m].
-        device: where results are returned; the tree itself is searched on the CPU.
+    The tree is built and searched on the CPU, wherever the map is.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood", Kd-F2M.
     """
 
-    def __init__(self, voxel_size_m: float = 0.4, device: torch.device | str = "cpu") -> None:
-        self._device = torch.device(device)
-        self._voxel_size_m = voxel_size_m
-        self.clear()
-
     def clear(self) -> None:
         """Forget every scan."""
-        self._map = AggregatedPoints(self._voxel_size_m, self._device)
+        super().clear()
         self._tree: cKDTree | None = None
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether there is nothing to search in."""
-        return len(self._map.points) == 0
 
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
         """Add a registered scan; the tree is rebuilt at the next search."""
-        self._map.insert(se3.transform(T_world_lidar, points), frames)
+        super().insert(points, T_world_lidar, frames)
         self._tree = None
 
-    def search(self, points_world: Float[Tensor, "n 3"], max_distance_m: float) -> Correspondences:
+    def nearest(
+        self, points_world: Float[Tensor, "n 3"], places: Int[Tensor, "n"], max_distance_m: float
+    ) -> Neighbours:
         """The exact nearest neighbour within `max_distance_m`."""
-        if self.is_empty:
-            return no_correspondences(points_world)
         if self._tree is None:
             # A sliding-midpoint tree is built four times faster than a balanced one and searched as fast.
-            self._tree = cKDTree(self._map.points.cpu().numpy(), balanced_tree=False, compact_nodes=False)
-        distances, index = self._tree.query(points_world.cpu().numpy(), distance_upper_bound=max_distance_m, workers=-1)
-        found = np.isfinite(distances)
-        nearest = torch.from_numpy(np.where(found, index, 0)).to(self._device)
-        mask = torch.from_numpy(found).to(self._device)
-        return Correspondences(self._map.points[nearest], self._map.normals[nearest], mask)
+            points = self.points.cpu().contiguous().numpy()
+            self._tree = cKDTree(points, leafsize=_LEAF_SIZE, balanced_tree=False, compact_nodes=False)
+        queries = points_world.cpu().numpy()
+        workers = 1 if len(queries) < _FEW else -1
+        reach_m = max_distance_m + _MARGIN_M
+        found = self._tree.query(queries, k=2, distance_upper_bound=reach_m, workers=workers)
+        distances, index = np.asarray(found[0]), np.asarray(found[1])
+        index = np.where(np.isfinite(distances[:, 0]), index[:, 0], -1)
+        others = np.minimum(distances[:, 1], reach_m)
+        return Neighbours(
+            points_world,
+            places,
+            torch.from_numpy(index).to(self._device),
+            torch.from_numpy(others).to(points_world),
+        )

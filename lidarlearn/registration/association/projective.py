@@ -3,13 +3,14 @@
 from collections import deque
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.normals import normal_map
 from lidarlearn.geometry.projection import SphericalProjection, activated
-from lidarlearn.registration.association.base import Association, Correspondences, no_correspondences
+from lidarlearn.registration.association.base import Association, Neighbours
+from lidarlearn.registration.association.candidates import nearest_two
 
 _NOTHING = torch.iinfo(torch.int64).max  # its lower 32 bits are -1
 
@@ -34,13 +35,20 @@ class Projective(Association):
 
     def clear(self) -> None:
         """Forget every scan."""
-        self._frames: deque[tuple[Tensor, Tensor]] = deque()  # points and normals in the world, of each scan
+        self._frames: deque[tuple[Tensor, Tensor]] = deque()  # coordinates and normals in the world, of each scan
+        self._coordinates = torch.zeros(3, 0, device=self._device)
+        self._normals = torch.zeros(0, 3, device=self._device)
         self._T_lidar_world = torch.eye(4, dtype=torch.float64, device=self._device)
 
     @property
-    def is_empty(self) -> bool:
-        """Whether there is nothing to search in."""
-        return not any(len(points) for points, _ in self._frames)
+    def points(self) -> Float[Tensor, "m 3"]:
+        """All points of the map [m], oldest first."""
+        return self._coordinates.mT
+
+    @property
+    def normals(self) -> Float[Tensor, "m 3"]:
+        """Their unit normals."""
+        return self._normals
 
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
         """Add a registered scan and project the whole map into its image."""
@@ -48,36 +56,34 @@ class Projective(Association):
         normals = normal_map(vertices)
         used = (normals != 0).any(dim=0) & activated(vertices)
         R = T_world_lidar[:3, :3].float()
-        self._frames.append((se3.transform(T_world_lidar, vertices[:, used].T), normals[:, used].T @ R.T))
+        self._frames.append((_moved(T_world_lidar, vertices[:, used]), (R @ normals[:, used]).mT))
         while len(self._frames) > frames:
             self._frames.popleft()
         self._T_lidar_world = se3.inverse(T_world_lidar)
-        self._points = torch.cat([points for points, _ in self._frames])
+        self._coordinates = torch.cat([coordinates for coordinates, _ in self._frames], dim=1)
         self._normals = torch.cat([normals for _, normals in self._frames])
         self._layers = self._project()
 
-    def search(self, points_world: Float[Tensor, "n 3"], max_distance_m: float) -> Correspondences:
-        """The closest map point of the same pixel within `max_distance_m`."""
-        if self.is_empty:
-            return no_correspondences(points_world)
-        pixel = self.projection.pixel_index(se3.transform(self._T_lidar_world, points_world))
-        candidates = self._layers.index_select(0, pixel.clamp(min=0))
-        offsets = self._points.index_select(0, candidates.flatten().clamp(min=0)).view(*candidates.shape, 3)
-        offsets -= points_world[:, None]
-        squared = offsets.square_() @ offsets.new_ones(3)  # a sum over so few is slow
-        squared.masked_fill_((candidates < 0) | (pixel < 0)[:, None], torch.inf)
-        best = squared.min(dim=1)
-        index = candidates.gather(1, best.indices[:, None])[:, 0].clamp(min=0)
-        return Correspondences(self._points[index], self._normals[index], best.values <= max_distance_m**2)
+    def places(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+        """The pixel of each point, -1 outside the image."""
+        return self.projection.pixel_index(se3.transform(self._T_lidar_world, points_world))
+
+    def nearest(
+        self, points_world: Float[Tensor, "n 3"], places: Int[Tensor, "n"], max_distance_m: float
+    ) -> Neighbours:
+        """The closest map point of each pixel."""
+        candidates = self._layers.index_select(0, places.clamp(min=0))
+        nothing = (candidates < 0) | (places < 0)[:, None]
+        nearest = nearest_two(self._coordinates, candidates.clamp_(min=0), points_world, ~nothing)
+        index = torch.where(nearest.first_m < torch.inf, nearest.index, -1)
+        return Neighbours(points_world, places, index, nearest.second_m)
 
     def _project(self) -> Tensor:
         """Index of the nearest point of each scan in each pixel, (pixels, scans), -1 where there is none."""
-        T = self._T_lidar_world.float()
-        local = torch.addmm(T[:3, 3:], T[:3, :3], self._points.T)  # coordinates apart, as projections like them
-        pixel = self.projection.pixel_index(local.T)
+        local = _moved(self._T_lidar_world, self._coordinates)
+        pixel = self.projection.pixel_index(local.mT)
         scans = len(self._frames)
-        lengths = torch.tensor([len(points) for points, _ in self._frames], device=self._device)
-        layer = torch.arange(scans, device=self._device).repeat_interleave(lengths)
+        layer = torch.cat([pixel.new_full((len(normals),), i) for i, (_, normals) in enumerate(self._frames)])
         last = self.projection.pixels * scans  # where points go that fall into no pixel
         slot = torch.where(pixel < 0, last, pixel.mul_(scans).add_(layer))
         x, y, z = local
@@ -87,3 +93,9 @@ class Projective(Association):
         layers = torch.full((last + 1,), _NOTHING, device=self._device)
         layers.scatter_reduce_(0, slot, key, "amin")
         return layers[:-1].to(torch.int32).unflatten(0, (self.projection.pixels, scans))  # the lower half of each key
+
+
+def _moved(T: Float[Tensor, "4 4"], coordinates: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
+    """Points whose coordinates lie apart in memory, as projections and distances like them, and stay apart."""
+    T = T.float()
+    return torch.addmm(T[:3, 3:], T[:3, :3], coordinates)

@@ -1,0 +1,43 @@
+"""Maps that aggregate the last scans, one point per voxel."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.geometry import se3
+from lidarlearn.registration.association.aggregated_points import AggregatedPoints
+from lidarlearn.registration.association.base import Association
+
+
+class AggregatedMap(Association):
+    """An association with the points of the last scans aggregated.
+
+    Args:
+        voxel_size_m: edge of the voxels, which hold one point each [m].
+        device: where the map is kept.
+
+    Source: Dellenbach et al. 2021, III-A "Local map and neighborhood".
+    """
+
+    def __init__(self, voxel_size_m: float = 0.4, device: torch.device | str = "cpu") -> None:
+        self._device = torch.device(device)
+        self._voxel_size_m = voxel_size_m
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget every scan."""
+        self._map = AggregatedPoints(self._voxel_size_m, self._device)
+
+    def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
+        """Add a registered scan."""
+        self._map.insert(se3.transform(T_world_lidar, points), frames)
+
+    @property
+    def points(self) -> Float[Tensor, "m 3"]:
+        """All points of the map [m], oldest first."""
+        return self._map.points
+
+    @property
+    def normals(self) -> Float[Tensor, "m 3"]:
+        """Their unit normals."""
+        return self._map.normals

@@ -1,0 +1,58 @@
+"""The nearest two of a handful of candidates for each point."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class NearestTwo:
+    """The best candidate of each point, and how far off the best and the second best are.
+
+    Args:
+        index: the nearest map point.
+        first_m: its distance [m], infinite where there is no candidate.
+        second_m: distance of the second nearest [m], infinite where there is none.
+    """
+
+    index: Int[Tensor, "n"]
+    first_m: Float[Tensor, "n"]
+    second_m: Float[Tensor, "n"]
+
+    def improved(self, which: Int[Tensor, "m"], by: "NearestTwo") -> "NearestTwo":
+        """The best two of these and, for some points, of others."""
+        first_m, index = self.first_m[which], torch.where(by.first_m < self.first_m[which], by.index, self.index[which])
+        second_m = torch.maximum(first_m, by.first_m).minimum(self.second_m[which]).minimum(by.second_m)
+        return NearestTwo(
+            self.index.index_copy(0, which, index),
+            self.first_m.index_copy(0, which, first_m.minimum(by.first_m)),
+            self.second_m.index_copy(0, which, second_m),
+        )
+
+
+def nearest_two(
+    coordinates: Float[Tensor, "3 m"],
+    candidates: Int[Tensor, "n c"],
+    points: Float[Tensor, "n 3"],
+    usable: Bool[Tensor, "n c"] | None = None,
+) -> NearestTwo:
+    """Compare the candidates of each point.
+
+    Args:
+        coordinates: map points [m], their coordinates apart in memory: distances are summed up axis by axis.
+        candidates: indices of map points.
+        points: the points [m].
+        usable: which candidates count, all of them if not given.
+    """
+    squared = torch.zeros(candidates.shape, dtype=points.dtype, device=points.device)
+    for coordinate, queried in zip(coordinates, points.unbind(-1), strict=True):
+        offset = coordinate.index_select(0, candidates.flatten()).view_as(candidates) - queried[:, None]
+        squared.addcmul_(offset, offset)
+    if usable is not None:
+        squared.masked_fill_(~usable, torch.inf)
+    nearest = squared.argmin(dim=1, keepdim=True)
+    first = squared.gather(1, nearest)[:, 0]
+    second = squared.scatter_(1, nearest, torch.inf).amin(dim=1)
+    return NearestTwo(candidates.gather(1, nearest)[:, 0].long(), first.sqrt_(), second.sqrt_())
