@@ -11,7 +11,10 @@ def voxel_cells(points: Float[Tensor, "*batch 3"], voxel_size_m: float) -> Int[T
 
 
 def voxel_keys(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """One integer per cell, different for different cells, of the fewest bits: sorting costs time for each of them."""
+    """One integer per cell, different for different cells, of 32 bits where they suffice: sorting takes half the time.
+
+    The box around all cells may hold 2^63 of them.
+    """
     if len(cells) == 0:
         return cells[:, 0]
     cells = cells - cells.amin(dim=0)

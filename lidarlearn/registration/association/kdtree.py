@@ -9,7 +9,7 @@ from torch import Tensor
 from lidarlearn.registration.association.aggregated_map import AggregatedMap
 from lidarlearn.registration.association.base import Neighbours
 
-_MARGIN_M = 0.1  # searched beyond what is asked for: who finds nothing need not look again before he has moved so far
+_MARGIN_M = 0.1  # searched beyond: a point that finds nothing need not look again until it moved so far
 _FEW = 1000  # queries that one thread has answered before others have started
 _LEAF_SIZE = 32  # points; smaller leaves take longer to build, and no less to search
 
