@@ -148,11 +148,11 @@ def _successes(
         result = backend.registration.register(
             points,
             backend.local_map.association,
-            (T_true @ T_some).to(points.device),
+            T_true @ T_some,
             backend.max_search_distance_m,
             normals,
         )
-        xi = se3.log(se3.inverse(T_true) @ result.T_world_lidar.cpu())
+        xi = se3.log(se3.inverse(T_true) @ result.T_world_lidar)
         near = xi[:, :3].norm(dim=1) < probe.success_m
         found.append((near & (xi[:, 3:].norm(dim=1) < math.radians(probe.success_deg))).float())
     return torch.cat(found)

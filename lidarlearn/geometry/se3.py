@@ -7,6 +7,7 @@ and keep the dtype and device of their arguments. Poses are float64 by conventio
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 # Below this angle [rad] closed forms lose digits to cancellation and Taylor series take over.
 _SMALL_ANGLE = 1e-2
@@ -21,10 +22,9 @@ def from_rotation_translation(
     R: Float[Tensor, "*batch 3 3"], t: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """The transform x -> R x + t."""
-    top = torch.cat([R, t[..., None]], dim=-1)
-    bottom = torch.zeros_like(top[..., :1, :])
-    bottom[..., 3] = 1
-    return torch.cat([top, bottom], dim=-2)
+    T = pad(torch.cat([R, t[..., None]], dim=-1), (0, 0, 0, 1))
+    T[..., 3, 3] = 1
+    return T
 
 
 def inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
@@ -44,19 +44,18 @@ def orthonormalize(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"
 
 
 def transform(T_target_source: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch n 3"]) -> Tensor:
-    """Points in the target frame, in the dtype of the points.
+    """Points in the target frame, in the dtype and on the device of the points.
 
-    The product is taken in the dtype of the points: cheap for a scan of float32 points under a float64 pose.
+    The product is taken there, too: cheap for a scan of float32 points on a GPU under a float64 pose on the CPU.
     """
-    T = T_target_source.to(points.dtype)
+    T = T_target_source.to(points)
     return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
 
 
 def hat(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The matrix W of the cross product, W w = v x w."""
-    x, y, z = v.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=v.dtype, device=v.device)
+    return torch.linalg.cross(eye.expand(*v.shape, 3), v[..., None, :])
 
 
 def exp(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
@@ -64,7 +63,10 @@ def exp(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
     rho, phi = xi[..., :3], xi[..., 3:]
     W = hat(phi)
     W2 = W @ W
-    a, b, c = _series(phi)
+    angle, a, b = _sine_and_cosine(phi)
+    squared = angle * angle
+    small = squared < _SMALL_ANGLE**2
+    c = torch.where(small, 1 / 6 - squared / 120, (1 - a) / torch.where(small, 1.0, squared))
     eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
     R = eye + a * W + b * W2
     V = eye + b * W + c * W2
@@ -75,20 +77,17 @@ def log(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
     """The twist (translation [m], rotation [rad]) whose `exp` is T; rotations up to but not including pi."""
     phi = rotation_log(T[..., :3, :3])
     W = hat(phi)
-    a, b, _ = _series(phi)
-    squared = (phi * phi).sum(-1)[..., None, None]
+    angle, a, b = _sine_and_cosine(phi)
+    squared = angle * angle
     small = squared < _SMALL_ANGLE**2
-    safe = torch.where(small, torch.ones_like(squared), squared)
-    d = torch.where(small, 1 / 12 + squared / 720, (1 - a / (2 * b)) / safe)
+    d = torch.where(small, 1 / 12 + squared / 720, (1 - a / (2 * b)) / torch.where(small, 1.0, squared))
     V_inv = torch.eye(3, dtype=T.dtype, device=T.device) - W / 2 + d * (W @ W)
     return torch.cat([(V_inv @ T[..., :3, 3:])[..., 0], phi], dim=-1)
 
 
 def rotation_log(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     """Rotation vector [rad] of a rotation matrix, accurate for tiny angles where acos of the trace is not."""
-    twice_sin_axis = torch.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], dim=-1
-    )
+    twice_sin_axis = _twice_sine_axis(R)
     sin2 = (twice_sin_axis * twice_sin_axis).sum(-1, keepdim=True) / 4
     cos = (R.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
     small = (sin2 < _SMALL_ANGLE**2) & (cos > 0)
@@ -98,8 +97,9 @@ def rotation_log(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
 
 
 def rotation_angle(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
-    """Rotation angle [rad] of a transform, in [0, pi)."""
-    return rotation_log(T[..., :3, :3]).norm(dim=-1)
+    """Rotation angle [rad] of a transform, in [0, pi], accurate for tiny angles where acos of the trace is not."""
+    R = T[..., :3, :3]
+    return torch.atan2(_twice_sine_axis(R).norm(dim=-1), R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
 
 
 def from_euler(parameters: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
@@ -139,13 +139,13 @@ def accumulate(T_relative: Float[Tensor, "m 4 4"]) -> Float[Tensor, "n 4 4"]:
     return torch.stack(poses)
 
 
-def _series(phi: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
-    """sin(x)/x, (1-cos x)/x^2, (x-sin x)/x^3 of x = |phi|, each of shape (*batch, 1, 1)."""
-    squared = (phi * phi).sum(-1)[..., None, None]
-    small = squared < _SMALL_ANGLE**2
-    safe = torch.where(small, torch.ones_like(squared), squared)  # the double where keeps gradients finite
-    x = safe.sqrt()
-    a = torch.where(small, 1 - squared / 6 + squared**2 / 120, x.sin() / x)
-    b = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - x.cos()) / safe)
-    c = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (x - x.sin()) / (x * safe))
-    return a, b, c
+def _twice_sine_axis(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """The axis of a rotation, twice as long as the sine of its angle."""
+    twice = R - R.mT
+    return torch.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], dim=-1)
+
+
+def _sine_and_cosine(phi: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Angle x = |phi|, sin(x)/x and (1 - cos x)/x^2, each of shape (*batch, 1, 1)."""
+    x = phi.norm(dim=-1)[..., None, None]
+    return x, torch.sinc(x / torch.pi), torch.sinc(x / (2 * torch.pi)).square() / 2

@@ -1,5 +1,7 @@
 """Voxel grids: integer cells of points, and one point per cell."""
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -11,16 +13,16 @@ def voxel_cells(points: Float[Tensor, "*batch 3"], voxel_size_m: float) -> Int[T
 
 
 def voxel_keys(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """One integer per cell, different for different cells, of 32 bits where they suffice: sorting takes half the time.
+    """One integer per cell, different for different cells, of 32 bits where they suffice.
 
     The box around all cells may hold 2^63 of them.
     """
     if len(cells) == 0:
         return cells[:, 0]
-    cells = cells - cells.amin(dim=0)
-    nx, ny, nz = (cells.amax(dim=0) + 1).tolist()
-    keys = (cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]
-    return keys.int() if nx * ny * nz < 1 << 31 else keys
+    axes = [axis - axis.min() for axis in cells.unbind(1)]
+    _, ny, nz = edges = [int(axis.max()) + 1 for axis in axes]
+    x, y, z = (axis.int() for axis in axes) if math.prod(edges) < 1 << 31 else axes
+    return (x * ny).add_(y).mul_(nz).add_(z)
 
 
 def grid_sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor, "m"]:
@@ -32,16 +34,22 @@ def grid_sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor
     Source: Dellenbach et al. 2021, IV-A: 0.4 m for Kd-F2M.
     """
     keys = voxel_keys(voxel_cells(points, voxel_size_m))
-    unique, inverse = torch.unique(keys, return_inverse=True)
-    index = torch.arange(len(points), device=points.device)
-    priority = (_hash(index) << 32) | index
-    drawn = priority.new_full((len(unique),), torch.iinfo(torch.int64).max)
-    drawn.scatter_reduce_(0, inverse, priority, "amin")
-    return (drawn & 0xFFFFFFFF).sort().values
+    if keys.dtype != torch.int32:
+        keys = torch.unique(keys, return_inverse=True)[1]
+    # Voxel and hash in one integer: sorted, each voxel begins with the point that is drawn.
+    drawn = _hash(torch.arange(len(points), device=points.device))
+    ordered, index = torch.sort(drawn.bitwise_or_(keys.long().bitwise_left_shift_(32)))
+    voxels = ordered.bitwise_right_shift_(32)
+    begins = torch.ones_like(voxels, dtype=torch.bool)
+    torch.ne(voxels[1:], voxels[:-1], out=begins[1:])
+    return index[begins].sort().values
 
 
 def _hash(index: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """31 bits that follow no order, unlike those of a multiplication alone. Source: Wellons' lowbias32, 2018."""
-    h = ((index ^ (index >> 16)) * 0x7FEB352D) & 0xFFFFFFFF
-    h = ((h ^ (h >> 15)) * 0x846CA68B) & 0xFFFFFFFF
-    return (h ^ (h >> 16)) >> 1
+    """32 bits, different for different indices, that follow no order, unlike those of a multiplication alone.
+
+    Source: Wellons' lowbias32, 2018.
+    """
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        index = (index >> shift).bitwise_xor_(index).mul_(factor).bitwise_and_(0xFFFFFFFF)
+    return (index >> 16).bitwise_xor_(index)

@@ -22,10 +22,9 @@ def deskew(
     """
     if times is None or not len(points):
         return points
-    earliest, latest = times.min(), times.max()
-    step = ((times - earliest) / (latest - earliest).clamp(min=1e-6) * (_STEPS - 1)).round().long()
-    instants = torch.linspace(0, 1, _STEPS, device=points.device, dtype=torch.float64)
-    instants = earliest + instants * (latest - earliest)
-    T_pose_instant = se3.exp(instants[:, None] * se3.log(T_previous_new)).to(points.dtype)
+    earliest, latest = torch.stack(times.aminmax()).tolist()
+    step = ((times - earliest) / max(latest - earliest, 1e-6) * (_STEPS - 1)).round().long()
+    instants = torch.linspace(earliest, latest, _STEPS, dtype=torch.float64)
+    T_pose_instant = se3.exp(instants[:, None] * se3.log(T_previous_new)).to(points)
     R, t = T_pose_instant[:, :3, :3][step], T_pose_instant[:, :3, 3][step]
     return (R @ points[..., None])[..., 0] + t

@@ -22,7 +22,7 @@ def start_motions() -> Float[Tensor, "h 4 4"]:
 
 def surprise_motions(T_guess: Float[Tensor, "4 4"], T_last_motion: Float[Tensor, "4 4"]) -> Float[Tensor, "h 4 4"]:
     """The guess, the last motion, twice it (a lost scan), none (a repeated scan), and turns from the last motion."""
-    turns = torch.zeros(len(_YAWS_DEG), 6, dtype=torch.float64, device=T_guess.device)
-    turns[:, 5] = torch.tensor(_YAWS_DEG, device=T_guess.device) * (math.pi / 180)
-    few = torch.stack([T_guess, T_last_motion, T_last_motion @ T_last_motion, torch.eye(4).to(T_guess)])
+    turns = torch.zeros(len(_YAWS_DEG), 6, dtype=torch.float64)
+    turns[:, 5] = torch.tensor(_YAWS_DEG) * (math.pi / 180)
+    few = torch.stack([T_guess, T_last_motion, T_last_motion @ T_last_motion, se3.identity()])
     return torch.cat([few, T_last_motion @ se3.from_euler(turns)])

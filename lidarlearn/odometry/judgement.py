@@ -11,6 +11,19 @@ from lidarlearn.registration.gauss_newton import RegistrationResult
 
 
 @dataclass(frozen=True)
+class MotionDifference:
+    """How far two motions are apart.
+
+    Args:
+        distance_m: length of the translation between them [m].
+        angle_deg: angle of the rotation between them [deg].
+    """
+
+    distance_m: float
+    angle_deg: float
+
+
+@dataclass(frozen=True)
 class Judgement:
     """When a registration is doubted.
 
@@ -42,13 +55,12 @@ class Judgement:
         """Whether enough of the scan fits the map."""
         return result.overlap.item() >= self.min_overlap and result.inlier_share.item() >= self.min_inlier_share
 
-    def is_plausible(self, before: Float[Tensor, "4 4"], after: Float[Tensor, "4 4"]) -> bool:
-        """Whether one motion can follow the other."""
-        deviation_m, deviation_deg = motion_difference(before, after)
-        return deviation_m <= self.max_deviation_m and deviation_deg <= self.max_deviation_deg
+    def is_plausible(self, deviation: MotionDifference) -> bool:
+        """Whether a motion that differs so much from the one before it can follow it."""
+        return deviation.distance_m <= self.max_deviation_m and deviation.angle_deg <= self.max_deviation_deg
 
 
-def motion_difference(T_a: Float[Tensor, "4 4"], T_b: Float[Tensor, "4 4"]) -> tuple[float, float]:
-    """Distance [m] and angle [deg] between two motions."""
+def motion_difference(T_a: Float[Tensor, "4 4"], T_b: Float[Tensor, "4 4"]) -> MotionDifference:
+    """The motion that remains between two motions."""
     T_a_b = se3.inverse(T_a) @ T_b
-    return T_a_b[:3, 3].norm().item(), math.degrees(se3.rotation_angle(T_a_b).item())
+    return MotionDifference(T_a_b[:3, 3].norm().item(), math.degrees(se3.rotation_angle(T_a_b).item()))

@@ -48,5 +48,5 @@ class LocalMap:
     def _is_key_frame(self, T_world_lidar: Float[Tensor, "4 4"]) -> bool:
         if self._T_world_key is None:
             return True
-        distance_m, angle_deg = motion_difference(self._T_world_key, T_world_lidar)
-        return distance_m >= self._key_frame_distance_m or angle_deg >= self._key_frame_angle_deg
+        moved = motion_difference(self._T_world_key, T_world_lidar)
+        return moved.distance_m >= self._key_frame_distance_m or moved.angle_deg >= self._key_frame_angle_deg

@@ -52,8 +52,8 @@ class Odometry(ScanByScan):
         self._max_range_m = max_range_m
         self._recovery = recovery
         self._device = torch.device(device)
-        self._T_world_lidar = se3.identity(device=self._device)
-        self._motion = se3.identity(device=self._device)  # last one that was trusted
+        self._T_world_lidar = se3.identity()
+        self._motion = se3.identity()  # last one that was trusted
         self._doubted_motion: Tensor | None = None
         self._first: PreparedScan | None = None  # until the motion within it is known
         self._surprises_m: deque[float] = deque(maxlen=5)
@@ -73,11 +73,11 @@ class Odometry(ScanByScan):
             T_previous_new, source = guess.T_previous_new, guess.source
             if self._frames == 1:
                 if self._recovery:
-                    T_previous_new, source = self._search(scan, start_motions().to(self._device)), "start"
+                    T_previous_new, source = self._search(scan, start_motions()), "start"
                 self._deskew_first(scan, T_previous_new, source)
             health = self._advance(scan, T_previous_new, source)
         self._frames += 1
-        return Frame(self._T_world_lidar.cpu(), health)
+        return Frame(self._T_world_lidar, health)
 
     def _in_range(self, points: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
         ranges = points.norm(dim=1)
@@ -104,7 +104,7 @@ class Odometry(ScanByScan):
         result = self._register(scan, T_previous_new, source)
         if self._judgement.accepts(result):
             self._backend.local_map.restart()
-            self._backend.local_map.update(first.deskewed(self._motion_to(result.T_world_lidar)), self._T_world_lidar)
+            self._backend.local_map.update(first.deskewed(self._motion_to(result)), self._T_world_lidar)
 
     def _advance(self, scan: PreparedScan, T_previous_new: Tensor, source: str) -> Health:
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
@@ -121,8 +121,9 @@ class Odometry(ScanByScan):
         if not self._judgement.accepts(result):
             return self._coast(health)
         self._fits.append(result.fit.item())
-        self._surprises_m.append(self._displacement_m(scan, T_previous_new, result.T_world_lidar))
-        self._trust(self._motion_to(result.T_world_lidar), health)
+        motion = self._motion_to(result)
+        self._surprises_m.append(_displacement_m(scan, T_previous_new, motion))
+        self._trust(motion, health)
         self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
         self._coasting = 0
         return health
@@ -137,7 +138,7 @@ class Odometry(ScanByScan):
         return self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m)
 
     def _agreement(self, scan: PreparedScan, result: RegistrationResult) -> float:
-        return self._backend.agreement(scan, self._motion_to(result.T_world_lidar), self._T_world_lidar)
+        return self._backend.agreement(scan, self._motion_to(result), self._T_world_lidar)
 
     def _search(self, scan: PreparedScan, T_previous_new: Float[Tensor, "h 4 4"]) -> Tensor:
         return self._backend.best_hypothesis(scan, T_previous_new, self._T_world_lidar)
@@ -153,9 +154,10 @@ class Odometry(ScanByScan):
     def _trust(self, motion: Tensor, health: Health) -> None:
         """Move, and take over the motion as the model of the next one if it is plausible or seen twice."""
         self._move(motion)
-        confirmed = self._doubted_motion is not None and self._judgement.is_plausible(self._doubted_motion, motion)
+        doubted, self._doubted_motion = self._doubted_motion, None
+        confirmed = doubted is not None and self._judgement.is_plausible(motion_difference(doubted, motion))
         if self._frames == 1 or not health.implausible or confirmed:
-            self._motion, self._doubted_motion = motion, None
+            self._motion = motion
         else:
             self._doubted_motion = motion
 
@@ -163,8 +165,7 @@ class Odometry(ScanByScan):
         self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ motion)
 
     def _assess(self, scan: PreparedScan, result: RegistrationResult, source: str) -> Health:
-        motion = self._motion_to(result.T_world_lidar)
-        deviation_m, deviation_deg = motion_difference(self._motion, motion)
+        deviation = motion_difference(self._motion, self._motion_to(result))
         information = result.information[0].item()
         return Health(
             frame=self._frames,
@@ -178,18 +179,19 @@ class Odometry(ScanByScan):
             min_information=information,
             degenerate=information < self._judgement.min_information,
             weakest_direction=tuple(result.weakest_direction.tolist()),
-            deviation_m=deviation_m,
-            deviation_deg=deviation_deg,
-            implausible=self._frames > 1 and not self._judgement.is_plausible(self._motion, motion),
+            deviation_m=deviation.distance_m,
+            deviation_deg=deviation.angle_deg,
+            implausible=self._frames > 1 and not self._judgement.is_plausible(deviation),
         )
 
     def _has_enough_points(self, scan: PreparedScan) -> bool:
         return int(scan.is_query.sum()) >= self._judgement.min_points
 
-    def _motion_to(self, T_world_new: Tensor) -> Tensor:
-        return se3.orthonormalize(se3.inverse(self._T_world_lidar) @ T_world_new)
+    def _motion_to(self, result: RegistrationResult) -> Tensor:
+        return se3.orthonormalize(se3.inverse(self._T_world_lidar) @ result.T_world_lidar)
 
-    def _displacement_m(self, scan: PreparedScan, T_previous_new: Tensor, T_world_new: Tensor) -> float:
-        """How far a point at the mean range was from where the guess had it."""
-        shift_m, angle_deg = motion_difference(T_previous_new, self._motion_to(T_world_new))
-        return shift_m + math.radians(angle_deg) * scan.points.norm(dim=1).mean().item()
+
+def _displacement_m(scan: PreparedScan, T_guess: Tensor, T_previous_new: Tensor) -> float:
+    """How far a point at the mean range was from where the guess had it."""
+    surprise = motion_difference(T_guess, T_previous_new)
+    return surprise.distance_m + math.radians(surprise.angle_deg) * scan.points.norm(dim=1).mean().item()

@@ -17,7 +17,7 @@ class Frame:
     """A scan's place in the trajectory.
 
     Args:
-        T_world_lidar: its pose, float64; the first one is the identity.
+        T_world_lidar: its pose, float64, on the CPU; the first one is the identity.
         health: whether to trust it.
     """
 
@@ -50,8 +50,8 @@ class InitializationAlone(ScanByScan):
     def __init__(self, initialization: Initialization, device: torch.device | str = "cpu") -> None:
         self._initialization = initialization
         self._device = torch.device(device)
-        self._motion = se3.identity(device=self._device)
-        self._T_world_lidar = se3.identity(device=self._device)
+        self._motion = se3.identity()
+        self._T_world_lidar = se3.identity()
         self._frames = 0
 
     def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
@@ -63,4 +63,4 @@ class InitializationAlone(ScanByScan):
             self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ self._motion)
         self._frames += 1
         health = Health(self._frames - 1, initialization=guess.source, points=len(points))
-        return Frame(self._T_world_lidar.cpu(), health)
+        return Frame(self._T_world_lidar, health)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarlearn.geometry import se3
@@ -21,7 +21,7 @@ _FEW = 0.1  # share of the points below which neighbours are too few for what th
 class RegistrationResult:
     """Where a scan fits, and how well: enough to judge an alignment instead of trusting it.
 
-    All fields share the batch shape of the initial poses.
+    All fields share the batch shape of the initial poses, and are on the CPU as poses are.
 
     Args:
         T_world_lidar: the registered poses, float64.
@@ -52,18 +52,27 @@ class RegistrationResult:
 
 @dataclass(frozen=True)
 class _System:
-    """Normal equations H xi = -g of one iteration, and what they were made of."""
+    """Normal equations H xi = -g of one iteration, and the correspondences that they were made of.
 
-    found: Neighbours | None
-    jacobians: Float[Tensor, "*batch m 6"]
-    weights: Float[Tensor, "*batch m"]
+    Args:
+        H: on the CPU, as g and the squares: six unknowns are solved there before a GPU has begun.
+        g: gradient of the weighted half squares.
+        squares: sum of the weighted squares [m^2].
+        found: the neighbours, for the next search.
+        mask: which points have a neighbour with a normal.
+        off_m: how far each of them is off the map's surface [m].
+        weights: of each point.
+        jacobians: of the residuals of each point.
+    """
+
     H: Float[Tensor, "*batch 6 6"]
     g: Float[Tensor, "*batch 6"]
-    weight: Float[Tensor, "*batch"]
-    neighbours: Int[Tensor, "*batch"]
-    inliers: Int[Tensor, "*batch"]
-    fit: Float[Tensor, "*batch"]
     squares: Float[Tensor, "*batch"]
+    found: Neighbours | None
+    mask: Bool[Tensor, "*batch m"]
+    off_m: Float[Tensor, "*batch m"]
+    weights: Float[Tensor, "*batch m"]
+    jacobians: Float[Tensor, "*batch m k 6"]
 
 
 @dataclass(frozen=True)
@@ -116,15 +125,15 @@ class GaussNewton:
         Args:
             points: the new scan [m], in its own frame.
             association: the map.
-            T_world_lidar: initial poses, float64.
+            T_world_lidar: initial poses, float64, on any device.
             search_distance_m: search distance of the first iteration [m].
             normals: unit normals of the new scan; only generalized ICP needs them.
 
         Returns:
             The result; with nothing to hold on to, the initial pose, not converged, with an overlap of 0.
         """
-        T = T_world_lidar
-        converged = torch.zeros(T.shape[:-2], dtype=torch.bool, device=T.device)
+        T = T_world_lidar.cpu()
+        converged = torch.zeros(T.shape[:-2], dtype=torch.bool)
         distance, iterations, found = search_distance_m, 0, None
         while iterations < self.max_iterations and not converged.all():
             iterations += 1
@@ -137,12 +146,12 @@ class GaussNewton:
             step = self._solve(system)
             T = T @ se3.exp(torch.where(converged[..., None], 0.0, step))
             if final:
-                converged = converged | (self._is_small(step) & (system.weight > 0))
+                converged = converged | (self._is_small(step) & (system.H != 0).any(-1).any(-1))
             distance *= self.narrowing
         T = se3.orthonormalize(T)
         if not converged.all():  # else the last system describes all of them, but for a small step
             system = self._linearize(points, association, T, self.search_distance_m, normals, found)
-        return _judge(T, iterations, converged, system, len(points))
+        return self._judge(T, iterations, converged, system)
 
     def agreement(
         self,
@@ -165,7 +174,8 @@ class GaussNewton:
             normals: as in `register`.
         """
         system = self._linearize(points, association, T_world_lidar, search_distance_m, normals)
-        return system.fit / (system.neighbours + _FEW * max(len(points), 1))
+        fit, neighbours = self._fits(system).sum(-1), system.mask.sum(-1)
+        return (fit / (neighbours + _FEW * max(len(points), 1))).cpu()
 
     def _linearize(
         self,
@@ -182,28 +192,25 @@ class GaussNewton:
         map_normals = found.normals.view_as(points_world)
         mask = (found.mask & (found.normals != 0).any(dim=-1)).view(points_world.shape[:-1])
         linear = self.residual.linearize(T, points, points_world, map_points, map_normals, normals)
-        size = linear.residuals.norm(dim=-1)
-        # Whatever is minimized, a pose is judged by how far points are off the map's surface, not along it.
-        off = size if linear.residuals.shape[-1] == 1 else ((points_world - map_points) * map_normals).sum(-1).abs()
+        offsets = points_world - map_points
+        is_distance = linear.residuals.shape[-1] == 1
+        size = linear.residuals[..., 0].abs() if is_distance else linear.residuals.norm(dim=-1)
         widening = distance_m / self.search_distance_m  # a narrow kernel would hold on to whatever is near by chance
-        squared_distances = (points_world - map_points).square().sum(-1)
-        w = self.weight.weight(size / widening, squared_distances / widening**2) * mask
-        J = linear.jacobians.flatten(-3, -2)
-        weights = w.repeat_interleave(linear.residuals.shape[-1], dim=-1)
+        squared_distances = offsets.square().sum(-1)
+        weights = self.weight.weight(size / widening, squared_distances / widening**2) * mask
         # Summed in single precision, H would no longer tell "nothing is known" from its own rounding.
-        J64 = J.double()
-        wJ = J64 * weights[..., None]
+        rows = linear.rows.double()
+        sums = ((rows * weights[..., None, None]).flatten(-3, -2).mT @ rows.flatten(-3, -2)).cpu()
         return _System(
+            H=sums[..., :6, :6],
+            g=sums[..., :6, 6],
+            squares=sums[..., 6, 6],
             found=found.neighbours,
-            jacobians=J,
+            mask=mask,
+            # Whatever is minimized, a pose is judged by how far points are off the map's surface, not along it.
+            off_m=size if is_distance else (offsets * map_normals).sum(-1).abs(),
             weights=weights,
-            H=wJ.mT @ J64,
-            g=(wJ.mT @ linear.residuals.flatten(-2)[..., None].double())[..., 0],
-            weight=w.sum(-1).double(),
-            neighbours=mask.sum(-1),
-            inliers=(mask & (off < self.inlier_residual_m)).sum(-1),
-            fit=(mask * torch.exp(-((off / self.fit_residual_m) ** 2))).sum(-1),
-            squares=(w * size * size).sum(-1).double(),
+            jacobians=linear.jacobians,
         )
 
     def _solve(self, system: _System) -> Float[Tensor, "*batch 6"]:
@@ -224,21 +231,28 @@ class GaussNewton:
         angle = step[..., 3:].norm(dim=-1) * (180 / torch.pi)
         return (step[..., :3].norm(dim=-1) < self.translation_tolerance_m) & (angle < self.rotation_tolerance_deg)
 
+    def _judge(self, T: Tensor, iterations: int, converged: Tensor, system: _System) -> RegistrationResult:
+        position = _position(system)
+        neighbour = system.mask.double()
+        sums = [neighbour, neighbour * (system.off_m < self.inlier_residual_m), self._fits(system), system.weights]
+        neighbours, inliers, fit, weight = torch.stack(sums).sum(-1).cpu()
+        points = max(system.mask.shape[-1], 1)
+        return RegistrationResult(
+            T_world_lidar=T,
+            iterations=iterations,
+            converged=converged,
+            overlap=neighbours / points,
+            inlier_share=inliers / neighbours.clamp(min=1),
+            fit=fit / points,
+            rmse_m=(system.squares / weight.clamp(min=1e-12)).sqrt(),
+            hessian=system.H,
+            information=position.information,
+            weakest_direction=position.directions[..., 0],
+        )
 
-def _judge(T: Tensor, iterations: int, converged: Tensor, system: _System, points: int) -> RegistrationResult:
-    position = _position(system)
-    return RegistrationResult(
-        T_world_lidar=T,
-        iterations=iterations,
-        converged=converged,
-        overlap=system.neighbours / max(points, 1),
-        inlier_share=system.inliers / system.neighbours.clamp(min=1),
-        fit=system.fit / max(points, 1),
-        rmse_m=(system.squares / system.weight.clamp(min=1e-12)).sqrt(),
-        hessian=system.H,
-        information=position.information,
-        weakest_direction=position.directions[..., 0],
-    )
+    def _fits(self, system: _System) -> Float[Tensor, "*batch m"]:
+        """How well each point fits the map's surface, 0..1, 0 without a neighbour."""
+        return system.mask * torch.exp(-((system.off_m / self.fit_residual_m) ** 2))
 
 
 @dataclass(frozen=True)
@@ -264,13 +278,16 @@ def _position(system: _System) -> _Position:
     H = torch.nan_to_num(0.5 * (system.H + system.H.mT))
     blocks = H.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 3)).mean(-1)  # of translation and of rotation
     ridge = torch.diag_embed(1e-6 * blocks.repeat_interleave(3, dim=-1) + 1e-9)
-    # 6x6 and on the critical path: a GPU's solvers would cost more than the trip.
-    H = (H + ridge).cpu()
-    covariance = torch.linalg.inv(H)
+    covariance = torch.linalg.inv(H + ridge)
     variances, directions = torch.linalg.eigh(covariance[..., :3, :3])
     variances, directions = variances.flip(-1), directions.flip(-1)
     responses = covariance[..., :, :3] @ directions / variances[..., None, :]
-    notice = (system.jacobians @ responses.to(system.jacobians)).abs() > _NOTICEABLE
-    information = (system.weights[..., None] * notice).mean(-2) if notice.shape[-2] else torch.zeros_like(variances)
-    device = system.H.device
-    return _Position(covariance.to(device), directions.to(device), responses.to(device), information.double())
+    return _Position(covariance, directions, responses, _information(system, responses))
+
+
+def _information(system: _System, responses: Float[Tensor, "*batch 6 3"]) -> Float[Tensor, "*batch 3"]:
+    """See `RegistrationResult.information`."""
+    moves = system.jacobians.flatten(-3, -2) @ responses.to(system.jacobians)
+    notices = (moves.abs() > _NOTICEABLE).to(moves).view(*system.jacobians.shape[:-1], 3).mean(-2)
+    share = (system.weights[..., None, :] @ notices)[..., 0, :] / max(system.weights.shape[-1], 1)
+    return share.double().cpu()

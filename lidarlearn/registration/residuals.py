@@ -19,12 +19,20 @@ class Linearization:
     """Residuals of n correspondences, k each, and their Jacobians.
 
     Args:
-        residuals: r [m].
-        jacobians: dr/dxi.
+        rows: dr/dxi and r [m] side by side: H and g of the normal equations are parts of one product.
     """
 
-    residuals: Float[Tensor, "*batch n k"]
-    jacobians: Float[Tensor, "*batch n k 6"]
+    rows: Float[Tensor, "*batch n k 7"]
+
+    @property
+    def residuals(self) -> Float[Tensor, "*batch n k"]:
+        """Residuals r [m]."""
+        return self.rows[..., 6]
+
+    @property
+    def jacobians(self) -> Float[Tensor, "*batch n k 6"]:
+        """Derivatives dr/dxi."""
+        return self.rows[..., :6]
 
 
 class Residual(ABC):
@@ -70,10 +78,10 @@ class PointToPlane(Residual):
         normals: Tensor | None = None,
     ) -> Linearization:
         """One residual per correspondence; zero where the map has no normal."""
-        normals_lidar = map_normals @ T_world_lidar[..., :3, :3].to(points.dtype)  # R^T n, row by row
+        normals_lidar = map_normals @ T_world_lidar[..., :3, :3].to(points)  # R^T n, row by row
         r = ((points_world - map_points) * map_normals).sum(-1, keepdim=True)
         lever = torch.linalg.cross(points.expand_as(normals_lidar), normals_lidar)
-        return Linearization(r, torch.cat([normals_lidar, lever], dim=-1)[..., None, :])
+        return Linearization(torch.cat([normals_lidar, lever, r], dim=-1)[..., None, :])
 
 
 class PointToPoint(Residual):
@@ -89,7 +97,7 @@ class PointToPoint(Residual):
         normals: Tensor | None = None,
     ) -> Linearization:
         """Three residuals per correspondence."""
-        return Linearization(points_world - map_points, _point_jacobian(T_world_lidar, points))
+        return Linearization(_point_rows(T_world_lidar, points, points_world - map_points))
 
 
 @dataclass(frozen=True)
@@ -120,21 +128,22 @@ class GeneralizedIcp(Residual):
         """Three residuals per correspondence."""
         if normals is None:
             raise ValueError("generalized ICP needs the normals of the new scan")
-        R = T_world_lidar[..., :3, :3].to(points.dtype)
+        R = T_world_lidar[..., :3, :3].to(points)
         own = normals @ R.mT
         own = torch.where((own != 0).any(-1, keepdim=True), own, map_normals)  # unknown: the surface it is matched with
         covariance = self._disc(map_normals) + self._disc(own)
         whitening = torch.linalg.cholesky(torch.linalg.inv(covariance)).mT * (2 * self.epsilon) ** 0.5
-        r = (whitening @ (points_world - map_points)[..., None])[..., 0]
-        return Linearization(r, whitening @ _point_jacobian(T_world_lidar, points))
+        return Linearization(whitening @ _point_rows(T_world_lidar, points, points_world - map_points))
 
     def _disc(self, normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
         eye = torch.eye(3, dtype=normals.dtype, device=normals.device)
         return eye - (1 - self.epsilon) * normals[..., :, None] * normals[..., None, :]
 
 
-def _point_jacobian(T_world_lidar: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "n 3"]) -> Tensor:
-    """d(T exp(xi) p)/dxi = [R, -R hat(p)], of shape (*batch, n, 3, 6)."""
-    R = T_world_lidar[..., None, :3, :3].to(points.dtype)
+def _point_rows(
+    T_world_lidar: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "n 3"], offsets: Float[Tensor, "*batch n 3"]
+) -> Float[Tensor, "*batch n 3 7"]:
+    """d(T exp(xi) p)/dxi = [R, -R hat(p)], and the offsets beside it."""
+    R = T_world_lidar[..., None, :3, :3].to(points)
     R = R.expand(*R.shape[:-3], len(points), 3, 3)
-    return torch.cat([R, -R @ se3.hat(points)], dim=-1)
+    return torch.cat([R, -R @ se3.hat(points), offsets[..., None]], dim=-1)

@@ -12,7 +12,7 @@ class InitialMotion:
     """A guess of the motion since the previous scan.
 
     Args:
-        T_previous_new: the motion, float64.
+        T_previous_new: the motion, float64, on the CPU as all poses of an odometry: only points are on its device.
         source: who made the guess: an initialization may fall back to another.
     """
 

@@ -62,7 +62,7 @@ class ElevationImage(Initialization):
         motion = None if previous is None else self._planar_motion(previous, new)
         if motion is None:
             return self._fallback.predict(points, last_motion)
-        return InitialMotion(motion.to(last_motion), "ei")
+        return InitialMotion(motion, "ei")
 
     def image(self, points: Float[Tensor, "n 3"]) -> np.ndarray:
         """Grey image (size_px, size_px) of the greatest height above the sensor in each cell, 0 where there is none."""

@@ -1,9 +1,9 @@
 """NI: no initialization."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarlearn.geometry import se3
 from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
 
 
@@ -12,4 +12,4 @@ class NoInitialization(Initialization):
 
     def predict(self, points: Float[Tensor, "n 3"], last_motion: Float[Tensor, "4 4"]) -> InitialMotion:
         """The identity."""
-        return InitialMotion(torch.eye(4, dtype=last_motion.dtype, device=last_motion.device), "ni")
+        return InitialMotion(se3.identity(), "ni")

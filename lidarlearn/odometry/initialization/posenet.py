@@ -40,5 +40,5 @@ class PoseNetInitialization(Initialization):
         vertices = self._network.projection.vertex_map(points.to(self._network.device))[None]
         previous, self._previous = self._previous, vertices
         if previous is None:
-            return InitialMotion(se3.identity(device=last_motion.device), "posenet")
-        return InitialMotion(self._network.relative_pose(previous, vertices)[0].to(last_motion), "posenet")
+            return InitialMotion(se3.identity(), "posenet")
+        return InitialMotion(self._network.relative_pose(previous, vertices)[0].cpu(), "posenet")

@@ -38,7 +38,7 @@ class Projective(Association):
         self._frames: deque[tuple[Tensor, Tensor]] = deque()  # coordinates and normals in the world, of each scan
         self._coordinates = torch.zeros(3, 0, device=self._device)
         self._normals = torch.zeros(0, 3, device=self._device)
-        self._T_lidar_world = torch.eye(4, dtype=torch.float64, device=self._device)
+        self._T_lidar_world = se3.identity()
 
     @property
     def points(self) -> Float[Tensor, "m 3"]:
@@ -55,7 +55,7 @@ class Projective(Association):
         vertices = self.projection.vertex_map(points)
         normals = normal_map(vertices)
         used = (normals != 0).any(dim=0) & activated(vertices)
-        R = T_world_lidar[:3, :3].float()
+        R = T_world_lidar[:3, :3].to(normals)
         self._frames.append((_moved(T_world_lidar, vertices[:, used]), (R @ normals[:, used]).mT))
         while len(self._frames) > frames:
             self._frames.popleft()
@@ -97,5 +97,5 @@ class Projective(Association):
 
 def _moved(T: Float[Tensor, "4 4"], coordinates: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
     """Points whose coordinates lie apart in memory, as projections and distances like them, and stay apart."""
-    T = T.float()
+    T = T.to(coordinates)
     return torch.addmm(T[:3, 3:], T[:3, :3], coordinates)
