@@ -1,5 +1,6 @@
 """The registration half of an odometry: sampling, local map and Gauss-Newton under one name such as `kd_f2m`."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -13,7 +14,9 @@ from lidarlearn.odometry.sampling import Sampling
 from lidarlearn.registration.association.aggregated_points import AggregatedPoints
 from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
 
-_HYPOTHESIS_ITERATIONS = 30  # enough to compare them: the best one is registered again
+# Enough to compare hypotheses: the best one is registered again.
+_HYPOTHESIS_ITERATIONS = 20
+_HYPOTHESIS_TOLERANCE = 10  # of the registration's
 _NORMAL_VOXEL_M = 0.4  # neighbourhoods for the normals of a new scan, which only generalized ICP needs
 
 
@@ -95,8 +98,13 @@ class Backend:
         The points are not deskewed: the guesses differ by more than the motion within a scan.
         """
         queries = scan.is_query.nonzero()[:, 0]
-        few = queries[:: max(len(queries) // self.hypothesis_points, 1)]
-        quick = replace(self.registration, max_iterations=_HYPOTHESIS_ITERATIONS)
+        few = queries[:: max(math.ceil(len(queries) / self.hypothesis_points), 1)]
+        quick = replace(
+            self.registration,
+            max_iterations=_HYPOTHESIS_ITERATIONS,
+            translation_tolerance_m=_HYPOTHESIS_TOLERANCE * self.registration.translation_tolerance_m,
+            rotation_tolerance_deg=_HYPOTHESIS_TOLERANCE * self.registration.rotation_tolerance_deg,
+        )
         result = quick.register(
             scan.points[few],
             self.local_map.association,

@@ -1,5 +1,6 @@
 """Gauss-Newton registration of a scan against a searchable map."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -112,6 +113,14 @@ class GaussNewton:
     max_step_m: float = 1.0
     max_step_deg: float = 10.0
 
+    @property
+    def _tolerances(self) -> Float[Tensor, "2"]:
+        return torch.tensor([self.translation_tolerance_m, math.radians(self.rotation_tolerance_deg)]).double()
+
+    @property
+    def _longest(self) -> Float[Tensor, "2"]:
+        return torch.tensor([self.max_step_m, math.radians(self.max_step_deg)]).double()
+
     def register(
         self,
         points: Float[Tensor, "n 3"],
@@ -143,10 +152,11 @@ class GaussNewton:
             distance = max(distance, self.search_distance_m)
             system = self._linearize(points[::stride], association, T, distance, used_normals, found)
             found = system.found
-            step = self._solve(system)
-            T = T @ se3.exp(torch.where(converged[..., None], 0.0, step))
+            step = torch.where(converged[..., None], 0.0, self._solve(system))
+            T = T @ se3.exp(step)
             if final:
-                converged = converged | (self._is_small(step) & (system.H != 0).any(-1).any(-1))
+                is_small = (_lengths(step) < self._tolerances).all(-1)
+                converged = converged | (is_small & (system.H != 0).flatten(-2).any(-1))
             distance *= self.narrowing
         T = se3.orthonormalize(T)
         if not converged.all():  # else the last system describes all of them, but for a small step
@@ -220,16 +230,9 @@ class GaussNewton:
         unknown = (position.information < self.min_information)[..., None]
         along = position.directions.mT @ step[..., :3, :]
         step = step - position.responses @ (unknown * along)
-        return self._limit(step[..., 0])
-
-    def _limit(self, step: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
-        max_angle = torch.pi / 180 * self.max_step_deg
-        excess = torch.maximum(step[..., :3].norm(dim=-1) / self.max_step_m, step[..., 3:].norm(dim=-1) / max_angle)
-        return step / excess.clamp(min=1)[..., None]
-
-    def _is_small(self, step: Float[Tensor, "*batch 6"]) -> Bool[Tensor, "*batch"]:
-        angle = step[..., 3:].norm(dim=-1) * (180 / torch.pi)
-        return (step[..., :3].norm(dim=-1) < self.translation_tolerance_m) & (angle < self.rotation_tolerance_deg)
+        step = step[..., 0]
+        excess = _lengths(step) / self._longest
+        return step / excess.amax(dim=-1, keepdim=True).clamp(min=1)
 
     def _judge(self, T: Tensor, iterations: int, converged: Tensor, system: _System) -> RegistrationResult:
         position = _position(system)
@@ -255,6 +258,11 @@ class GaussNewton:
         return system.mask * torch.exp(-((system.off_m / self.fit_residual_m) ** 2))
 
 
+def _lengths(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 2"]:
+    """Translation [m] and angle [rad] of small motions."""
+    return xi.unflatten(-1, (2, 3)).norm(dim=-1)
+
+
 @dataclass(frozen=True)
 class _Position:
     """What the normal equations say about the position, along the axes of its covariance.
@@ -275,13 +283,12 @@ class _Position:
 def _position(system: _System) -> _Position:
     # A ridge far below any information keeps an empty system solvable, and above the rounding of the Jacobians it
     # holds what nothing is known of, such as the yaw on a bare plane.
-    H = torch.nan_to_num(0.5 * (system.H + system.H.mT))
-    blocks = H.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 3)).mean(-1)  # of translation and of rotation
-    ridge = torch.diag_embed(1e-6 * blocks.repeat_interleave(3, dim=-1) + 1e-9)
-    covariance = torch.linalg.inv(H + ridge)
-    variances, directions = torch.linalg.eigh(covariance[..., :3, :3])
-    variances, directions = variances.flip(-1), directions.flip(-1)
-    responses = covariance[..., :, :3] @ directions / variances[..., None, :]
+    H = system.H.clone()
+    diagonal = H.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 3))  # of translation and of rotation
+    diagonal += 1e-6 * diagonal.mean(-1, keepdim=True) + 1e-9
+    covariance = torch.linalg.inv(H)
+    negative_variances, directions = torch.linalg.eigh(-covariance[..., :3, :3])
+    responses = covariance[..., :, :3] @ directions / -negative_variances[..., None, :]
     return _Position(covariance, directions, responses, _information(system, responses))
 
 

@@ -46,10 +46,8 @@ def nearest_two(
         points: the points [m].
         usable: which candidates count, all of them if not given.
     """
-    squared = torch.zeros(candidates.shape, dtype=points.dtype, device=points.device)
-    for coordinate, queried in zip(coordinates, points.unbind(-1), strict=True):
-        offset = coordinate.index_select(0, candidates.flatten()).view_as(candidates) - queried[:, None]
-        squared.addcmul_(offset, offset)
+    offsets = coordinates.index_select(1, candidates.flatten()).unflatten(1, candidates.shape) - points.mT[..., None]
+    squared = offsets.square_().sum(0)
     if usable is not None:
         squared.masked_fill_(~usable, torch.inf)
     nearest = squared.argmin(dim=1, keepdim=True)

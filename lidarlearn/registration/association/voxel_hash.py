@@ -12,6 +12,7 @@ from lidarlearn.registration.association.candidates import NearestTwo, nearest_t
 
 _CANDIDATES_AT_ONCE = 1 << 19  # bounds the memory of a wide search
 _FEW_CANDIDATES = 1 << 16  # so many are looked at in the time that it takes to ask
+_MIN_RADIUS = 2  # voxels; points without a neighbour look so far, and need not look again soon
 _MAX_RADIUS = 4  # voxels; beyond, a search would visit more than 9^3 of them per point
 
 
@@ -27,11 +28,8 @@ class VoxelHash(AggregatedMap):
     def nearest(
         self, points_world: Float[Tensor, "n 3"], places: Int[Tensor, "n"], max_distance_m: float
     ) -> Neighbours:
-        """The nearest point in wider and wider cubes of voxels around each point, until none can be nearer.
-
-        Points without a neighbour look one voxel farther than they must, and need not look again soon.
-        """
-        widest = min(math.ceil(max_distance_m / self._voxel_size_m) + 1, _MAX_RADIUS)
+        """The nearest point in wider and wider cubes of voxels around each point, until none can be nearer."""
+        widest = max(_MIN_RADIUS, min(math.ceil(max_distance_m / self._voxel_size_m), _MAX_RADIUS))
         radius = 1
         while radius < widest and len(points_world) * (2 * radius + 3) ** 3 <= _FEW_CANDIDATES:
             radius += 1
