@@ -85,13 +85,13 @@ def convergence_basin(
     for i, scan in enumerate(sequence):
         ranges = scan.points.norm(dim=1)
         points = scan.points[(ranges >= probe.min_range_m) & (ranges <= probe.max_range_m)]
-        prepared = backend.prepare(points, None)
+        sampled = backend.sampling.sample(points)
         if i and i % probe.every == 0:
-            normals = backend.normals(prepared.points, prepared.is_query)
-            queries = prepared.points[prepared.is_query]
+            normals = backend.normals(sampled.points, sampled.is_query)
+            queries = sampled.points[sampled.is_query]
             successes += _successes(backend, queries, normals, T_true[i], T_error, probe)
             scans += 1
-        backend.local_map.update(prepared.points, T_true[i])
+        backend.local_map.update(sampled.points, T_true[i])
         advance()
     shares = (successes / scans).split([len(probe.offsets_m) * probe.directions, len(probe.angles_deg) * 2])
     by_offset = shares[0].view(-1, probe.directions).mean(1).tolist()

@@ -4,13 +4,12 @@ import math
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.odometry.deskew import deskew
 from lidarlearn.odometry.local_map import LocalMap
-from lidarlearn.odometry.sampling import Sampling
+from lidarlearn.odometry.sampling import SampledScan, Sampling
 from lidarlearn.registration.association.aggregated_points import AggregatedPoints
 from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
 
@@ -18,25 +17,6 @@ from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
 _HYPOTHESIS_ITERATIONS = 20
 _HYPOTHESIS_TOLERANCE = 10  # of the registration's
 _NORMAL_VOXEL_M = 0.4  # neighbourhoods for the normals of a new scan, which only generalized ICP needs
-
-
-@dataclass(frozen=True)
-class PreparedScan:
-    """The sampled points of a scan as measured, and which of them are registered.
-
-    Args:
-        points: points for the map [m].
-        times: share of the scan period of each, see `lidarlearn.data.sequence.Scan`.
-        is_query: whether a point is also registered.
-    """
-
-    points: Float[Tensor, "n 3"]
-    times: Float[Tensor, "n"] | None
-    is_query: Bool[Tensor, "n"]
-
-    def deskewed(self, T_previous_new: Float[Tensor, "4 4"]) -> Float[Tensor, "n 3"]:
-        """All points, compensated for the motion over one scan period."""
-        return deskew(self.points, self.times, T_previous_new)
 
 
 @dataclass
@@ -60,16 +40,8 @@ class Backend:
     hypothesis_points: int = 2000
     hypothesis_distance_m: float = 1.5
 
-    def prepare(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None) -> PreparedScan:
-        """Sample a scan."""
-        sampled = self.sampling.sample(points)
-        is_query = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-        is_query[sampled.query_index] = True
-        index = sampled.map_index
-        return PreparedScan(points[index], None if times is None else times[index], is_query[index])
-
     def register(
-        self, scan: PreparedScan, T_previous_new: Tensor, T_world_previous: Tensor, surprise_m: float
+        self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor, surprise_m: float
     ) -> RegistrationResult:
         """Register a scan from one guess of its motion.
 
@@ -91,7 +63,7 @@ class Backend:
         )
 
     def best_hypothesis(
-        self, scan: PreparedScan, T_previous_new: Float[Tensor, "h 4 4"], T_world_previous: Tensor
+        self, scan: SampledScan, T_previous_new: Float[Tensor, "h 4 4"], T_world_previous: Tensor
     ) -> Tensor:
         """The guess, among several, from which a few points of the scan come to agree with the map best.
 
@@ -115,7 +87,7 @@ class Backend:
         best = self._agreement(scan.points, few, result.T_world_lidar).argmax()
         return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar[best]))
 
-    def agreement(self, scan: PreparedScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:
+    def agreement(self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:
         """How well a motion agrees with the map, see `GaussNewton.agreement`."""
         T_world_new = T_world_previous @ T_previous_new
         return self._agreement(scan.deskewed(T_previous_new), scan.is_query, T_world_new).item()

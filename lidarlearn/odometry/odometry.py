@@ -9,11 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.odometry.backend import Backend, PreparedScan
+from lidarlearn.odometry.backend import Backend
 from lidarlearn.odometry.health import Health, Status
 from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
 from lidarlearn.odometry.initialization.base import Initialization
 from lidarlearn.odometry.judgement import Judgement, motion_difference
+from lidarlearn.odometry.sampling import SampledScan
 from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
 from lidarlearn.registration.gauss_newton import RegistrationResult
 
@@ -55,7 +56,7 @@ class Odometry(ScanByScan):
         self._T_world_lidar = se3.identity()
         self._motion = se3.identity()  # last one that was trusted
         self._doubted_motion: Tensor | None = None
-        self._first: PreparedScan | None = None  # until the motion within it is known
+        self._first: SampledScan | None = None  # until the motion within it is known
         self._surprises_m: deque[float] = deque(maxlen=5)
         self._fits: deque[float] = deque(maxlen=5)
         self._frames = 0
@@ -66,7 +67,7 @@ class Odometry(ScanByScan):
         """Guess the motion, register, judge, try again if in doubt, add the scan to the map."""
         points, times = self._in_range(points, times)
         guess = self._initialization.predict(points, self._motion)
-        scan = self._backend.prepare(points, times)
+        scan = self._backend.sampling.sample(points, times)
         if self._backend.local_map.association.is_empty:
             health = self._begin(scan)
         else:
@@ -85,7 +86,7 @@ class Odometry(ScanByScan):
         points = points[valid].to(self._device)
         return points, None if times is None else times[valid].to(self._device)
 
-    def _begin(self, scan: PreparedScan) -> Health:
+    def _begin(self, scan: SampledScan) -> Health:
         """Start a map with a scan, at the origin or, after a loss, where the motion model puts it."""
         status: Status = "ok" if self._frames == 0 else "restarted"
         if self._frames:
@@ -96,7 +97,7 @@ class Odometry(ScanByScan):
             self._coasting = 0
         return Health(self._frames, status=status, points=len(scan.points))
 
-    def _deskew_first(self, scan: PreparedScan, T_previous_new: Tensor, source: str) -> None:
+    def _deskew_first(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> None:
         """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the poses."""
         first, self._first = self._first, None
         if first is None or first.times is None or not self._has_enough_points(scan):
@@ -106,7 +107,7 @@ class Odometry(ScanByScan):
             self._backend.local_map.restart()
             self._backend.local_map.update(first.deskewed(self._motion_to(result)), self._T_world_lidar)
 
-    def _advance(self, scan: PreparedScan, T_previous_new: Tensor, source: str) -> Health:
+    def _advance(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> Health:
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
         if not self._has_enough_points(scan):
             return self._coast(Health(self._frames, initialization=source, points=len(scan.points), overlap=0.0))
@@ -132,15 +133,15 @@ class Odometry(ScanByScan):
         fits_as_before = result.fit.item() >= self._judgement.min_fit_share * max(self._fits, default=0.0)
         return health.implausible or not fits_as_before or not self._judgement.accepts(result)
 
-    def _register(self, scan: PreparedScan, T_previous_new: Tensor, source: str) -> RegistrationResult:
+    def _register(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> RegistrationResult:
         is_searched = source in ("start", "recovery")
         surprise_m = _SEARCHED_M if is_searched else max(self._surprises_m, default=math.inf)
         return self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m)
 
-    def _agreement(self, scan: PreparedScan, result: RegistrationResult) -> float:
+    def _agreement(self, scan: SampledScan, result: RegistrationResult) -> float:
         return self._backend.agreement(scan, self._motion_to(result), self._T_world_lidar)
 
-    def _search(self, scan: PreparedScan, T_previous_new: Float[Tensor, "h 4 4"]) -> Tensor:
+    def _search(self, scan: SampledScan, T_previous_new: Float[Tensor, "h 4 4"]) -> Tensor:
         return self._backend.best_hypothesis(scan, T_previous_new, self._T_world_lidar)
 
     def _coast(self, health: Health) -> Health:
@@ -164,7 +165,7 @@ class Odometry(ScanByScan):
     def _move(self, motion: Tensor) -> None:
         self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ motion)
 
-    def _assess(self, scan: PreparedScan, result: RegistrationResult, source: str) -> Health:
+    def _assess(self, scan: SampledScan, result: RegistrationResult, source: str) -> Health:
         deviation = motion_difference(self._motion, self._motion_to(result))
         information = result.information[0].item()
         return Health(
@@ -184,14 +185,14 @@ class Odometry(ScanByScan):
             implausible=self._frames > 1 and not self._judgement.is_plausible(deviation),
         )
 
-    def _has_enough_points(self, scan: PreparedScan) -> bool:
+    def _has_enough_points(self, scan: SampledScan) -> bool:
         return int(scan.is_query.sum()) >= self._judgement.min_points
 
     def _motion_to(self, result: RegistrationResult) -> Tensor:
         return se3.orthonormalize(se3.inverse(self._T_world_lidar) @ result.T_world_lidar)
 
 
-def _displacement_m(scan: PreparedScan, T_guess: Tensor, T_previous_new: Tensor) -> float:
+def _displacement_m(scan: SampledScan, T_guess: Tensor, T_previous_new: Tensor) -> float:
     """How far a point at the mean range was from where the guess had it."""
     surprise = motion_difference(T_guess, T_previous_new)
     return surprise.distance_m + math.radians(surprise.angle_deg) * scan.points.norm(dim=1).mean().item()

@@ -2,8 +2,15 @@ import pytest
 import torch
 
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.geometry.voxels import voxel_cells
-from lidarlearn.odometry.sampling import GridSampling, ImageSampling, map_voxel_m, query_voxel_m
+from lidarlearn.geometry.voxels import voxel_cells, voxel_means
+from lidarlearn.odometry.sampling import (
+    GridSampling,
+    ImageSampling,
+    SampledScan,
+    map_voxel_m,
+    mean_voxel_m,
+    query_voxel_m,
+)
 
 IMAGE = SphericalProjection(64, 720, 3.0, -24.0)
 
@@ -14,45 +21,70 @@ def points() -> torch.Tensor:
     return points * torch.tensor([1.0, 1.0, 0.1])
 
 
-def test_the_grid_holds_one_point_per_voxel_for_map_and_queries(points):
-    sampled = GridSampling(0.4, 1.0).sample(points)
-    in_map = points[sampled.map_index]
-    for source, index, size in ((points, sampled.map_index, 0.4), (in_map, sampled.query_index, 1.0)):
-        cells = voxel_cells(points[index], size)
-        assert len(cells.unique(dim=0)) == len(cells) == len(voxel_cells(source, size).unique(dim=0))
+def rows(points: torch.Tensor) -> set[tuple[float, ...]]:
+    return {tuple(point) for point in points.tolist()}
 
 
-@pytest.mark.parametrize(("rows", "up", "down", "grid"), [(64, 3.0, -24.0, (0.4, 1.0)), (64, 21.6, -21.6, (0.4, 1.0))])
-def test_sensors_of_64_beams_use_the_grid_of_the_paper(rows, up, down, grid):
+def queries(sampled: SampledScan) -> torch.Tensor:
+    return sampled.points[sampled.is_query]
+
+
+@pytest.mark.parametrize("mean_voxel_m", [0.2, None])
+def test_the_grid_holds_one_point_per_voxel_for_map_and_queries(points, mean_voxel_m):
+    sampled = GridSampling(0.4, 1.0, mean_voxel_m).sample(points)
+    source = points if mean_voxel_m is None else voxel_means(points, points, mean_voxel_m)
+    for chosen, among, size in ((sampled.points, source, 0.4), (queries(sampled), sampled.points, 1.0)):
+        cells = voxel_cells(chosen, size)
+        assert len(cells.unique(dim=0)) == len(cells) == len(voxel_cells(among, size).unique(dim=0))
+        assert rows(chosen) <= rows(among)
+
+
+def test_means_carry_less_of_the_noise_and_the_mean_of_the_times():
+    wall = torch.rand(50_000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.0, 8.0, 2.0])
+    wall += torch.tensor([5.1, 0.0, 0.0])
+    noise = 0.02 * torch.randn(50_000, generator=torch.Generator().manual_seed(1))
+    noisy = wall + torch.stack([noise, 0 * noise, 0 * noise], dim=1)
+    times = wall[:, 1] / 8 - 0.5
+    averaged, plain = (GridSampling(0.4, 0.6, m).sample(noisy, times) for m in (0.2, None))
+    assert (averaged.points[:, 0] - 5.1).std() < 0.3 * (plain.points[:, 0] - 5.1).std()
+    for sampled in (averaged, plain):
+        assert sampled.times is not None
+        torch.testing.assert_close(sampled.times, sampled.points[:, 1] / 8 - 0.5, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("rows", "up", "down", "grid"), [(64, 3.0, -24.0, (0.4, 0.6, 0.2)), (64, 21.6, -21.6, (0.4, 0.6, 0.2))]
+)
+def test_the_map_of_64_beams_has_the_grid_of_the_paper(rows, up, down, grid):
     projection = SphericalProjection(rows, 720, up, down)
-    assert (map_voxel_m(projection), query_voxel_m(projection)) == grid
+    assert (map_voxel_m(projection), query_voxel_m(projection), mean_voxel_m(projection)) == grid
 
 
 @pytest.mark.parametrize(("rows", "up", "down"), [(32, 11.3, -31.3), (16, 16.0, -16.0)])
 def test_beams_far_apart_share_wider_voxels_and_every_point_of_the_map_is_registered(rows, up, down):
     projection = SphericalProjection(rows, 720, up, down)
     assert 0.4 < map_voxel_m(projection) <= query_voxel_m(projection) <= 1.2
+    assert mean_voxel_m(projection) is None
 
 
 @pytest.mark.parametrize("sampling", [GridSampling(), ImageSampling(IMAGE), ImageSampling(IMAGE, max_queries=100)])
 def test_queries_are_distinct_points_of_the_map(points, sampling):
     sampled = sampling.sample(points)
-    queries = set(sampled.query_index.tolist())
-    assert len(queries) == len(sampled.query_index) > 0
-    assert queries <= set(sampled.map_index.tolist())
+    assert len(rows(queries(sampled))) == sampled.is_query.sum() > 0
+    assert len(sampled.is_query) == len(sampled.points)
 
 
 def test_the_image_holds_the_nearest_point_of_each_pixel(points):
     sampled = ImageSampling(IMAGE).sample(points)
     nearest = IMAGE.nearest_points(points)
-    assert torch.equal(sampled.map_index, nearest[nearest >= 0])
+    assert torch.equal(sampled.points, points[nearest[nearest >= 0]])
 
 
 def test_queries_are_as_many_as_asked_for_and_spread_over_the_image(points):
     sampled = ImageSampling(IMAGE, max_queries=2000).sample(points)
-    assert len(sampled.query_index) == 2000
-    pixel = IMAGE.pixel_index(points[sampled.query_index])
-    all_pixels = IMAGE.pixel_index(points[sampled.map_index])
+    assert sampled.is_query.sum() == 2000
+    pixel = IMAGE.pixel_index(queries(sampled))
+    all_pixels = IMAGE.pixel_index(sampled.points)
     for part, parts in ((lambda p: p // 720, 64), (lambda p: p % 720 // 45, 16)):
         share = part(pixel).bincount(minlength=parts) / 2000
         expected = part(all_pixels).bincount(minlength=parts) / len(all_pixels)
@@ -63,4 +95,4 @@ def test_queries_are_as_many_as_asked_for_and_spread_over_the_image(points):
 @pytest.mark.parametrize("count", [0, 1])
 def test_tiny_scans_are_sampled(sampling, count):
     sampled = sampling.sample(torch.tensor([[10.0, 2.0, -1.0]]).expand(count, 3))
-    assert len(sampled.map_index) == len(sampled.query_index) == count
+    assert len(sampled.points) == sampled.is_query.sum() == count

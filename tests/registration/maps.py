@@ -48,12 +48,12 @@ def scene(name: str, association: str) -> Scene:
     sampling, searchable = make(association)
     for i in range(_MAP_SCANS):
         points = way.scan(i).points
-        searchable.insert(points[sampling.sample(points).map_index], way.T_world_lidar[i], 30)
-    points = way.scan(_MAP_SCANS).points
-    index = sampling.sample(points).query_index
-    normals = neighbourhood_normals(points, 0.4)[index]
+        searchable.insert(sampling.sample(points).points, way.T_world_lidar[i], 30)
+    sampled = sampling.sample(way.scan(_MAP_SCANS).points)
+    normals = neighbourhood_normals(sampled.points, 0.4)[sampled.is_query]
+    queries = sampled.points[sampled.is_query]
     stride = 4 if association == "p" else 1
-    return Scene(searchable, points[index][::stride], normals[::stride], way.T_world_lidar[_MAP_SCANS])
+    return Scene(searchable, queries[::stride], normals[::stride], way.T_world_lidar[_MAP_SCANS])
 
 
 def make(association: str) -> tuple[Sampling, Association]:
@@ -61,7 +61,7 @@ def make(association: str) -> tuple[Sampling, Association]:
     if association == "p":
         projection = SphericalProjection()
         return ImageSampling(projection), Projective(projection)
-    return GridSampling(), {"kd": KdTree, "vh": VoxelHash}[association]()
+    return GridSampling(0.4, 1.0, mean_voxel_m=None), {"kd": KdTree, "vh": VoxelHash}[association]()
 
 
 def errors(T_estimate: Tensor, T_true: Tensor) -> tuple[Tensor, Tensor]:
