@@ -37,23 +37,8 @@ def query_voxel_m(projection: SphericalProjection, dense_m: float = 0.6) -> floa
         projection: the sensor's image, one row a beam.
         dense_m: what it is for 64 beams [m].
     """
-    return dense_m if _is_dense(projection) else map_voxel_m(projection)
-
-
-def mean_voxel_m(projection: SphericalProjection) -> float | None:
-    """Voxel edge for means of points [m]: half the map's for 64 beams, no means with fewer.
-
-    Averaging the rings of beams far apart pulls their points to the middle of the voxels: with 32 beams the swinging
-    pitch of a Segway is followed half as well.
-
-    Args:
-        projection: the sensor's image, one row a beam.
-    """
-    return map_voxel_m(projection) / 2 if _is_dense(projection) else None
-
-
-def _is_dense(projection: SphericalProjection) -> bool:
-    return map_voxel_m(projection) == _DENSE_MAP_VOXEL_M
+    map_voxel = map_voxel_m(projection)
+    return dense_m if map_voxel == _DENSE_MAP_VOXEL_M else map_voxel
 
 
 @dataclass(frozen=True)
@@ -96,14 +81,15 @@ class GridSampling(Sampling):
         map_voxel_m: voxel edge for the map [m].
         query_voxel_m: voxel edge for the points to register [m].
         mean_voxel_m: the points are chosen among the means of all points in voxels of this edge [m], which are less
-            noisy; among the points themselves if it is None.
+            noisy; among the points themselves if it is None. Much wider, means lie on a lattice that moves with the
+            sensor, and draw the registration to rest.
 
     Source: Dellenbach et al. 2021, IV-A: 0.4 m.
     """
 
     map_voxel_m: float = 0.4
     query_voxel_m: float = 0.6
-    mean_voxel_m: float | None = 0.2
+    mean_voxel_m: float | None = 0.1
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
         """One point of every voxel, drawn by `grid_sample`; times are averaged, too."""

@@ -9,12 +9,10 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.registration.association.base import Association, Neighbours
+from lidarlearn.registration.normal_equations import NormalEquations, position_of
 from lidarlearn.registration.residuals import PointToPlane, Residual
 from lidarlearn.registration.weights import Proximity, RobustWeight
 
-# A residual notices a move of 1 m if it changes by more than this [m]: the sine of 17 deg, beyond the error of nearly
-# all normals.
-_NOTICEABLE = 0.3
 _FEW = 0.1  # share of the points below which neighbours are too few for what they say to be believed
 
 
@@ -49,31 +47,6 @@ class RegistrationResult:
     hessian: Float[Tensor, "*batch 6 6"]
     information: Float[Tensor, "*batch 3"]
     weakest_direction: Float[Tensor, "*batch 3"]
-
-
-@dataclass(frozen=True)
-class _System:
-    """Normal equations H xi = -g of one iteration, and the correspondences that they were made of.
-
-    Args:
-        H: on the CPU, as g and the squares: six unknowns are solved there before a GPU has begun.
-        g: gradient of the weighted half squares.
-        squares: sum of the weighted squares [m^2].
-        found: the neighbours, for the next search.
-        mask: which points have a neighbour with a normal.
-        off_m: how far each of them is off the map's surface [m].
-        weights: of each point.
-        jacobians: of the residuals of each point.
-    """
-
-    H: Float[Tensor, "*batch 6 6"]
-    g: Float[Tensor, "*batch 6"]
-    squares: Float[Tensor, "*batch"]
-    found: Neighbours | None
-    mask: Bool[Tensor, "*batch m"]
-    off_m: Float[Tensor, "*batch m"]
-    weights: Float[Tensor, "*batch m"]
-    jacobians: Float[Tensor, "*batch m k 6"]
 
 
 @dataclass(frozen=True)
@@ -150,18 +123,18 @@ class GaussNewton:
             stride = 1 if final else self.coarse_stride
             used_normals = None if normals is None else normals[::stride]
             distance = max(distance, self.search_distance_m)
-            system = self._linearize(points[::stride], association, T, distance, used_normals, found)
-            found = system.found
-            step = torch.where(converged[..., None], 0.0, self._solve(system))
+            equations = self._linearize(points[::stride], association, T, distance, used_normals, found)
+            found = equations.found
+            step = torch.where(converged[..., None], 0.0, self._solve(equations))
             T = T @ se3.exp(step)
             if final:
                 is_small = (_lengths(step) < self._tolerances).all(-1)
-                converged = converged | (is_small & (system.H != 0).flatten(-2).any(-1))
+                converged = converged | (is_small & (equations.H != 0).flatten(-2).any(-1))
             distance *= self.narrowing
         T = se3.orthonormalize(T)
-        if not converged.all():  # else the last system describes all of them, but for a small step
-            system = self._linearize(points, association, T, self.search_distance_m, normals, found)
-        return self._judge(T, iterations, converged, system)
+        if not converged.all():  # else the last equations describe all of them, but for a small step
+            equations = self._linearize(points, association, T, self.search_distance_m, normals, found)
+        return self._judge(T, iterations, converged, equations)
 
     def agreement(
         self,
@@ -183,8 +156,8 @@ class GaussNewton:
             search_distance_m: what is farther from the map says nothing [m]: wide enough to see what does not fit.
             normals: as in `register`.
         """
-        system = self._linearize(points, association, T_world_lidar, search_distance_m, normals)
-        fit, neighbours = self._fits(system).sum(-1), system.mask.sum(-1)
+        equations = self._linearize(points, association, T_world_lidar, search_distance_m, normals)
+        fit, neighbours = self._fits(equations).sum(-1), equations.mask.sum(-1)
         return (fit / (neighbours + _FEW * max(len(points), 1))).cpu()
 
     def _linearize(
@@ -195,7 +168,7 @@ class GaussNewton:
         distance_m: float,
         normals: Tensor | None,
         last: Neighbours | None = None,
-    ) -> _System:
+    ) -> NormalEquations:
         points_world = se3.transform(T, points)
         found = association.search(points_world.reshape(-1, 3), distance_m, last)
         map_points = found.points.view_as(points_world)
@@ -211,7 +184,7 @@ class GaussNewton:
         # Summed in single precision, H would no longer tell "nothing is known" from its own rounding.
         rows = linear.rows.double()
         sums = ((rows * weights[..., None, None]).flatten(-3, -2).mT @ rows.flatten(-3, -2)).cpu()
-        return _System(
+        return NormalEquations(
             H=sums[..., :6, :6],
             g=sums[..., :6, 6],
             squares=sums[..., 6, 6],
@@ -223,10 +196,10 @@ class GaussNewton:
             jacobians=linear.jacobians,
         )
 
-    def _solve(self, system: _System) -> Float[Tensor, "*batch 6"]:
+    def _solve(self, equations: NormalEquations) -> Float[Tensor, "*batch 6"]:
         """The minimum of the linearized energy, on condition that the position stays where nothing is known of it."""
-        position = _position(system)
-        step = -(position.covariance @ system.g[..., None])
+        position = position_of(equations)
+        step = -(position.covariance @ equations.g[..., None])
         unknown = (position.information < self.min_information)[..., None]
         along = position.directions.mT @ step[..., :3, :]
         step = step - position.responses @ (unknown * along)
@@ -234,12 +207,17 @@ class GaussNewton:
         excess = _lengths(step) / self._longest
         return step / excess.amax(dim=-1, keepdim=True).clamp(min=1)
 
-    def _judge(self, T: Tensor, iterations: int, converged: Tensor, system: _System) -> RegistrationResult:
-        position = _position(system)
-        neighbour = system.mask.double()
-        sums = [neighbour, neighbour * (system.off_m < self.inlier_residual_m), self._fits(system), system.weights]
+    def _judge(self, T: Tensor, iterations: int, converged: Tensor, equations: NormalEquations) -> RegistrationResult:
+        position = position_of(equations)
+        neighbour = equations.mask.double()
+        sums = [
+            neighbour,
+            neighbour * (equations.off_m < self.inlier_residual_m),
+            self._fits(equations),
+            equations.weights,
+        ]
         neighbours, inliers, fit, weight = torch.stack(sums).sum(-1).cpu()
-        points = max(system.mask.shape[-1], 1)
+        points = max(equations.mask.shape[-1], 1)
         return RegistrationResult(
             T_world_lidar=T,
             iterations=iterations,
@@ -247,54 +225,17 @@ class GaussNewton:
             overlap=neighbours / points,
             inlier_share=inliers / neighbours.clamp(min=1),
             fit=fit / points,
-            rmse_m=(system.squares / weight.clamp(min=1e-12)).sqrt(),
-            hessian=system.H,
+            rmse_m=(equations.squares / weight.clamp(min=1e-12)).sqrt(),
+            hessian=equations.H,
             information=position.information,
             weakest_direction=position.directions[..., 0],
         )
 
-    def _fits(self, system: _System) -> Float[Tensor, "*batch m"]:
+    def _fits(self, equations: NormalEquations) -> Float[Tensor, "*batch m"]:
         """How well each point fits the map's surface, 0..1, 0 without a neighbour."""
-        return system.mask * torch.exp(-((system.off_m / self.fit_residual_m) ** 2))
+        return equations.mask * torch.exp(-((equations.off_m / self.fit_residual_m) ** 2))
 
 
 def _lengths(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 2"]:
     """Translation [m] and angle [rad] of small motions."""
     return xi.unflatten(-1, (2, 3)).norm(dim=-1)
-
-
-@dataclass(frozen=True)
-class _Position:
-    """What the normal equations say about the position, along the axes of its covariance.
-
-    Args:
-        covariance: inverse of the Hessian.
-        directions: the axes, unit columns, the least known first.
-        responses: how the whole pose moves, at least energy, when the position moves by one along each axis.
-        information: see `RegistrationResult.information`.
-    """
-
-    covariance: Float[Tensor, "*batch 6 6"]
-    directions: Float[Tensor, "*batch 3 3"]
-    responses: Float[Tensor, "*batch 6 3"]
-    information: Float[Tensor, "*batch 3"]
-
-
-def _position(system: _System) -> _Position:
-    # A ridge far below any information keeps an empty system solvable, and above the rounding of the Jacobians it
-    # holds what nothing is known of, such as the yaw on a bare plane.
-    H = system.H.clone()
-    diagonal = H.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 3))  # of translation and of rotation
-    diagonal += 1e-6 * diagonal.mean(-1, keepdim=True) + 1e-9
-    covariance = torch.linalg.inv(H)
-    negative_variances, directions = torch.linalg.eigh(-covariance[..., :3, :3])
-    responses = covariance[..., :, :3] @ directions / -negative_variances[..., None, :]
-    return _Position(covariance, directions, responses, _information(system, responses))
-
-
-def _information(system: _System, responses: Float[Tensor, "*batch 6 3"]) -> Float[Tensor, "*batch 3"]:
-    """See `RegistrationResult.information`."""
-    moves = system.jacobians.flatten(-3, -2) @ responses.to(system.jacobians)
-    notices = (moves.abs() > _NOTICEABLE).to(moves).view(*system.jacobians.shape[:-1], 3).mean(-2)
-    share = (system.weights[..., None, :] @ notices)[..., 0, :] / max(system.weights.shape[-1], 1)
-    return share.double().cpu()
