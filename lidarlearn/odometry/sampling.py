@@ -12,7 +12,7 @@ from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import grid_sample, voxel_means
 from lidarlearn.odometry.deskew import deskew
 
-_DENSE_MAP_VOXEL_M = 0.4
+_DENSE_MAP_VOXEL_M, _DENSE_MEAN_VOXEL_M = 0.4, 0.1
 _DENSE_RANGE_M = 35.0  # up to here neighbouring beams are no farther apart than a voxel
 
 
@@ -37,8 +37,22 @@ def query_voxel_m(projection: SphericalProjection, dense_m: float = 0.6) -> floa
         projection: the sensor's image, one row a beam.
         dense_m: what it is for 64 beams [m].
     """
-    map_voxel = map_voxel_m(projection)
-    return dense_m if map_voxel == _DENSE_MAP_VOXEL_M else map_voxel
+    return dense_m if _is_dense(projection) else map_voxel_m(projection)
+
+
+def mean_voxel_m(projection: SphericalProjection) -> float | None:
+    """Voxel edge for means of points [m], for 64 beams; with fewer there is little to average.
+
+    With 32 beams the pitch of a Segway would be followed a quarter less well.
+
+    Args:
+        projection: the sensor's image, one row a beam.
+    """
+    return _DENSE_MEAN_VOXEL_M if _is_dense(projection) else None
+
+
+def _is_dense(projection: SphericalProjection) -> bool:
+    return map_voxel_m(projection) == _DENSE_MAP_VOXEL_M
 
 
 @dataclass(frozen=True)

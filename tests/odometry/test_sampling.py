@@ -8,6 +8,7 @@ from lidarlearn.odometry.sampling import (
     ImageSampling,
     SampledScan,
     map_voxel_m,
+    mean_voxel_m,
     query_voxel_m,
 )
 
@@ -55,6 +56,7 @@ def test_means_carry_less_of_the_noise_and_the_mean_of_the_times():
 def test_the_map_of_64_beams_has_the_grid_of_the_paper(up, down):
     projection = SphericalProjection(64, 720, up, down)
     assert map_voxel_m(projection) == 0.4
+    assert mean_voxel_m(projection) == 0.1
     assert map_voxel_m(projection) < query_voxel_m(projection) < query_voxel_m(projection, dense_m=1.0) == 1.0
 
 
@@ -62,6 +64,7 @@ def test_the_map_of_64_beams_has_the_grid_of_the_paper(up, down):
 def test_beams_far_apart_share_wider_voxels_and_every_point_of_the_map_is_registered(rows, up, down):
     projection = SphericalProjection(rows, 720, up, down)
     assert 0.4 < map_voxel_m(projection) <= query_voxel_m(projection) <= 1.2
+    assert mean_voxel_m(projection) is None
 
 
 @pytest.mark.parametrize("sampling", [GridSampling(), ImageSampling(IMAGE), ImageSampling(IMAGE, max_queries=100)])
