@@ -19,10 +19,12 @@ def voxel_keys(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
     """
     if len(cells) == 0:
         return cells[:, 0]
-    axes = [axis - axis.min() for axis in cells.unbind(1)]
-    _, ny, nz = edges = [int(axis.max()) + 1 for axis in axes]
-    x, y, z = (axis.int() for axis in axes) if math.prod(edges) < 1 << 31 else axes
-    return (x * ny).add_(y).mul_(nz).add_(z)
+    axes = cells.unbind(1)
+    bounds = torch.stack([torch.stack(axis.aminmax()) for axis in axes]).cpu().tolist()
+    _, ny, nz = edges = [highest - lowest + 1 for lowest, highest in bounds]
+    x, y, z = (axis - lowest for axis, (lowest, _) in zip(axes, bounds, strict=True))
+    keys = x.mul_(ny).add_(y).mul_(nz).add_(z)
+    return keys.int() if math.prod(edges) < 1 << 31 else keys
 
 
 def grid_sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor, "m"]:

@@ -22,7 +22,7 @@ def deskew(
     """
     if times is None or not len(points):
         return points
-    earliest, latest = torch.stack(times.aminmax()).tolist()
+    earliest, latest = torch.stack(times.aminmax()).cpu().tolist()
     step = ((times - earliest) / max(latest - earliest, 1e-6) * (_STEPS - 1)).round().long()
     instants = torch.linspace(earliest, latest, _STEPS, dtype=torch.float64)
     T_pose_instant = se3.exp(instants[:, None] * se3.log(T_previous_new)).to(points)

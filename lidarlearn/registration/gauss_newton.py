@@ -169,6 +169,7 @@ class GaussNewton:
         normals: Tensor | None,
         last: Neighbours | None = None,
     ) -> NormalEquations:
+        T = T.to(points)
         points_world = se3.transform(T, points)
         found = association.search(points_world.reshape(-1, 3), distance_m, last)
         map_points = found.points.view_as(points_world)

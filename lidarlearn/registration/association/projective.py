@@ -38,7 +38,7 @@ class Projective(Association):
         self._frames: deque[tuple[Tensor, Tensor]] = deque()  # coordinates and normals in the world, of each scan
         self._coordinates = torch.zeros(3, 0, device=self._device)
         self._normals = torch.zeros(0, 3, device=self._device)
-        self._T_lidar_world = se3.identity()
+        self._T_lidar_world = se3.identity().to(self._coordinates)
 
     @property
     def points(self) -> Float[Tensor, "m 3"]:
@@ -59,7 +59,7 @@ class Projective(Association):
         self._frames.append((_moved(T_world_lidar, vertices[:, used]), (R @ normals[:, used]).mT))
         while len(self._frames) > frames:
             self._frames.popleft()
-        self._T_lidar_world = se3.inverse(T_world_lidar)
+        self._T_lidar_world = se3.inverse(T_world_lidar).to(vertices)
         self._coordinates = torch.cat([coordinates for coordinates, _ in self._frames], dim=1)
         self._normals = torch.cat([normals for _, normals in self._frames])
         self._layers = self._project()

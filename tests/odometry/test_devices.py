@@ -1,0 +1,34 @@
+"""Poses live on the CPU, points on the device of the odometry, and little passes between them."""
+
+import multiprocessing
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests import pretend_device
+from tests.odometry.odometries import build, kd_at_least, poses, run, scans
+
+SCANS = 5
+LAUNCHES, TRANSFERS = 1500, 100  # at most, for a scan; about 10 ms on a GPU
+
+
+def run_elsewhere(association: str) -> tuple[Tensor, int, int]:
+    """Poses, and what the last scan asked of the device."""
+    with pretend_device.pretended() as device:
+        odometry = build(f"cv+{association}_f2m", f"device={pretend_device.NAME}:0")
+        *before, last = scans()[:SCANS]
+        frames = run(odometry, before)
+        device.launches = device.transfers = 0
+        frames += run(odometry, [last])
+    return poses(frames), device.launches, device.transfers
+
+
+@pytest.mark.skipif(not pretend_device.IS_SUPPORTED, reason="needs torch 2.10")
+@kd_at_least
+def test_nothing_is_left_on_another_device(association):
+    with multiprocessing.get_context("spawn").Pool(1) as process:
+        elsewhere, launches, transfers = process.apply(run_elsewhere, (association,))
+    here = poses(run(build(f"cv+{association}_f2m"), scans()[:SCANS]))
+    assert torch.equal(elsewhere, here)
+    assert 0 < launches < LAUNCHES and 0 < transfers < TRANSFERS
