@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 NAME = "pretend"
-IS_SUPPORTED = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")  # torch 2.10
+IS_SUPPORTED = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")  # in recent torch
 _COPIES, _INDEXES = {"_to_copy", "copy_"}, {"index", "index_put_"}
 _TO_THE_CPU = {"_local_scalar_dense", "equal"}
 _WAITS = {"nonzero", "_unique2"}  # the size of the result must be known

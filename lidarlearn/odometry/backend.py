@@ -15,7 +15,7 @@ from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
 
 # Enough to compare hypotheses: the best one is registered again.
 _HYPOTHESIS_ITERATIONS = 20
-_HYPOTHESIS_TOLERANCE = 10  # of the registration's
+_HYPOTHESIS_TOLERANCE = 10  # times the registration's
 _NORMAL_VOXEL_M = 0.4  # neighbourhoods for the normals of a new scan, which only generalized ICP needs
 
 

@@ -88,11 +88,12 @@ class GaussNewton:
 
     @property
     def _tolerances(self) -> Float[Tensor, "2"]:
-        return torch.tensor([self.translation_tolerance_m, math.radians(self.rotation_tolerance_deg)]).double()
+        tolerances = [self.translation_tolerance_m, math.radians(self.rotation_tolerance_deg)]
+        return torch.tensor(tolerances, dtype=torch.float64)
 
     @property
     def _longest(self) -> Float[Tensor, "2"]:
-        return torch.tensor([self.max_step_m, math.radians(self.max_step_deg)]).double()
+        return torch.tensor([self.max_step_m, math.radians(self.max_step_deg)], dtype=torch.float64)
 
     def register(
         self,

@@ -24,7 +24,7 @@ def run_elsewhere(association: str) -> tuple[Tensor, int, int]:
     return poses(frames), device.launches, device.transfers
 
 
-@pytest.mark.skipif(not pretend_device.IS_SUPPORTED, reason="needs torch 2.10")
+@pytest.mark.skipif(not pretend_device.IS_SUPPORTED, reason="needs a more recent torch")
 @kd_at_least
 def test_nothing_is_left_on_another_device(association):
     with multiprocessing.get_context("spawn").Pool(1) as process:
