@@ -47,19 +47,6 @@ def grid_sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor
     return index[begins].sort().values
 
 
-def voxel_means(
-    points: Float[Tensor, "n 3"], values: Float[Tensor, "n c"], voxel_size_m: float
-) -> Float[Tensor, "m c"]:
-    """Means of what belongs to the points of every occupied voxel, in the order of `voxel_keys`.
-
-    They are summed up in double precision: exactly, for points of one voxel, and in any order.
-    """
-    keys = voxel_keys(voxel_cells(points, voxel_size_m))
-    unique, inverse, counts = torch.unique(keys, return_inverse=True, return_counts=True)
-    sums = torch.zeros(len(unique), values.shape[1], dtype=torch.float64, device=values.device)
-    return (sums.index_add_(0, inverse, values.double()) / counts[:, None]).to(values)
-
-
 def _hash(index: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     """32 bits, different for different indices, that follow no order, unlike those of a multiplication alone.
 

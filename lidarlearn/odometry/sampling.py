@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.geometry.voxels import grid_sample, voxel_means
+from lidarlearn.geometry.voxels import grid_sample
 from lidarlearn.odometry.deskew import deskew
 
-_DENSE_MAP_VOXEL_M, _DENSE_MEAN_VOXEL_M = 0.4, 0.1
+_DENSE_MAP_VOXEL_M, _PAPER_QUERY_VOXEL_M = 0.4, 1.0
 _DENSE_RANGE_M = 35.0  # up to here neighbouring beams are no farther apart than a voxel
 
 
@@ -30,29 +30,14 @@ def map_voxel_m(projection: SphericalProjection) -> float:
     return max(_DENSE_MAP_VOXEL_M, round(beam_spacing * _DENSE_RANGE_M, 1))
 
 
-def query_voxel_m(projection: SphericalProjection, dense_m: float = 0.6) -> float:
-    """Voxel edge for the points of a sensor that are registered [m]: with fewer than 64 beams, as for the map.
-
-    Args:
-        projection: the sensor's image, one row a beam.
-        dense_m: what it is for 64 beams [m].
-    """
-    return dense_m if _is_dense(projection) else map_voxel_m(projection)
-
-
-def mean_voxel_m(projection: SphericalProjection) -> float | None:
-    """Voxel edge for means of points [m], for 64 beams; with fewer there is little to average.
-
-    With 32 beams the pitch of a Segway would be followed a quarter less well.
+def query_voxel_m(projection: SphericalProjection) -> float:
+    """Voxel edge for the points that the paper's settings register [m]: 1 m for 64 beams, as for the map with fewer.
 
     Args:
         projection: the sensor's image, one row a beam.
     """
-    return _DENSE_MEAN_VOXEL_M if _is_dense(projection) else None
-
-
-def _is_dense(projection: SphericalProjection) -> bool:
-    return map_voxel_m(projection) == _DENSE_MAP_VOXEL_M
+    map_voxel = map_voxel_m(projection)
+    return _PAPER_QUERY_VOXEL_M if map_voxel == _DENSE_MAP_VOXEL_M else map_voxel
 
 
 @dataclass(frozen=True)
@@ -89,32 +74,27 @@ class Sampling(ABC):
 
 @dataclass(frozen=True)
 class GridSampling(Sampling):
-    """One point per voxel: fine for the map, coarse for the points to register.
+    """One point per voxel: fine for the map, as fine or coarser for the points to register.
 
     Args:
         map_voxel_m: voxel edge for the map [m].
-        query_voxel_m: voxel edge for the points to register [m].
-        mean_voxel_m: the points are chosen among the means of all points in voxels of this edge [m], which are less
-            noisy; among the points themselves if it is None. Much wider, means lie on a lattice that moves with the
-            sensor, and draw the registration to rest.
+        query_voxel_m: voxel edge for the points to register [m]; all of the map's, if it is no wider.
 
     Source: Dellenbach et al. 2021, IV-A: 0.4 m.
     """
 
     map_voxel_m: float = 0.4
-    query_voxel_m: float = 0.6
-    mean_voxel_m: float | None = 0.1
+    query_voxel_m: float = 0.4
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
-        """One point of every voxel, drawn by `grid_sample`; times are averaged, too."""
-        values = points if times is None else torch.cat([points, times[:, None]], dim=1)
-        if self.mean_voxel_m is not None:
-            values = voxel_means(points, values, self.mean_voxel_m)
-        values = values[grid_sample(values[:, :3], self.map_voxel_m)]
-        points, times = values[:, :3], None if times is None else values[:, 3]
-        is_query = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-        is_query[grid_sample(points, self.query_voxel_m)] = True
-        return SampledScan(points, times, is_query)
+        """One point of every voxel, drawn by `grid_sample`, in the order of the scan."""
+        index = grid_sample(points, self.map_voxel_m)
+        points = points[index]
+        is_query = torch.ones(len(points), dtype=torch.bool, device=points.device)
+        if self.query_voxel_m > self.map_voxel_m:
+            is_query[:] = False
+            is_query[grid_sample(points, self.query_voxel_m)] = True
+        return SampledScan(points, None if times is None else times[index], is_query)
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,12 @@ import pytest
 import torch
 
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.geometry.voxels import voxel_cells, voxel_means
+from lidarlearn.geometry.voxels import voxel_cells
 from lidarlearn.odometry.sampling import (
     GridSampling,
     ImageSampling,
     SampledScan,
     map_voxel_m,
-    mean_voxel_m,
     query_voxel_m,
 )
 
@@ -29,42 +28,31 @@ def queries(sampled: SampledScan) -> torch.Tensor:
     return sampled.points[sampled.is_query]
 
 
-@pytest.mark.parametrize("mean_voxel_m", [0.1, None])
-def test_the_grid_holds_one_point_per_voxel_for_map_and_queries(points, mean_voxel_m):
-    sampled = GridSampling(0.4, 1.0, mean_voxel_m).sample(points)
-    source = points if mean_voxel_m is None else voxel_means(points, points, mean_voxel_m)
-    for chosen, among, size in ((sampled.points, source, 0.4), (queries(sampled), sampled.points, 1.0)):
+@pytest.mark.parametrize("query_voxel_m", [0.4, 1.0])
+def test_the_grid_holds_one_point_per_voxel_for_map_and_queries(points, query_voxel_m):
+    sampled = GridSampling(0.4, query_voxel_m).sample(points)
+    for chosen, among, size in ((sampled.points, points, 0.4), (queries(sampled), sampled.points, query_voxel_m)):
         cells = voxel_cells(chosen, size)
         assert len(cells.unique(dim=0)) == len(cells) == len(voxel_cells(among, size).unique(dim=0))
         assert rows(chosen) <= rows(among)
 
 
-def test_means_carry_less_of_the_noise_and_the_mean_of_the_times():
-    wall = torch.rand(50_000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.0, 8.0, 2.0])
-    wall += torch.tensor([5.05, 0.0, 0.0])
-    noise = 0.01 * torch.randn(50_000, generator=torch.Generator().manual_seed(1))
-    noisy = wall + torch.stack([noise, 0 * noise, 0 * noise], dim=1)
-    times = wall[:, 1] / 8 - 0.5
-    averaged, plain = (GridSampling(0.4, 0.6, m).sample(noisy, times) for m in (0.1, None))
-    assert (averaged.points[:, 0] - 5.05).std() < 0.5 * (plain.points[:, 0] - 5.05).std()
-    for sampled in (averaged, plain):
-        assert sampled.times is not None
-        torch.testing.assert_close(sampled.times, sampled.points[:, 1] / 8 - 0.5, rtol=0, atol=1e-5)
+@pytest.mark.parametrize("sampling", [GridSampling(), ImageSampling(IMAGE)])
+def test_every_point_keeps_its_time(points, sampling):
+    sampled = sampling.sample(points, times=points[:, 0] / 100)
+    assert torch.equal(sampled.times, sampled.points[:, 0] / 100)
 
 
 @pytest.mark.parametrize(("up", "down"), [(3.0, -24.0), (21.6, -21.6)])
-def test_the_map_of_64_beams_has_the_grid_of_the_paper(up, down):
+def test_sensors_of_64_beams_use_the_grid_of_the_paper(up, down):
     projection = SphericalProjection(64, 720, up, down)
-    assert map_voxel_m(projection) == 0.4
-    assert mean_voxel_m(projection) == 0.1
-    assert map_voxel_m(projection) < query_voxel_m(projection) < query_voxel_m(projection, dense_m=1.0) == 1.0
+    assert (map_voxel_m(projection), query_voxel_m(projection)) == (0.4, 1.0)
 
 
 @pytest.mark.parametrize(("rows", "up", "down"), [(32, 11.3, -31.3), (16, 16.0, -16.0)])
 def test_beams_far_apart_share_wider_voxels_and_every_point_of_the_map_is_registered(rows, up, down):
     projection = SphericalProjection(rows, 720, up, down)
     assert 0.4 < map_voxel_m(projection) <= query_voxel_m(projection) <= 1.2
-    assert mean_voxel_m(projection) is None
 
 
 @pytest.mark.parametrize("sampling", [GridSampling(), ImageSampling(IMAGE), ImageSampling(IMAGE, max_queries=100)])

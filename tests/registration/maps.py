@@ -61,7 +61,7 @@ def make(association: str) -> tuple[Sampling, Association]:
     if association == "p":
         projection = SphericalProjection()
         return ImageSampling(projection), Projective(projection)
-    return GridSampling(0.4, 1.0, mean_voxel_m=None), {"kd": KdTree, "vh": VoxelHash}[association]()
+    return GridSampling(0.4, 1.0), {"kd": KdTree, "vh": VoxelHash}[association]()
 
 
 def errors(T_estimate: Tensor, T_true: Tensor) -> tuple[Tensor, Tensor]:
