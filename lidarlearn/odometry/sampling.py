@@ -84,7 +84,7 @@ class GridSampling(Sampling):
     """
 
     map_voxel_m: float = 0.4
-    query_voxel_m: float = 0.4
+    query_voxel_m: float = 0.6
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
         """One point of every voxel, drawn by `grid_sample`, in the order of the scan."""

@@ -28,7 +28,7 @@ def queries(sampled: SampledScan) -> torch.Tensor:
     return sampled.points[sampled.is_query]
 
 
-@pytest.mark.parametrize("query_voxel_m", [0.4, 1.0])
+@pytest.mark.parametrize("query_voxel_m", [0.4, 0.6])
 def test_the_grid_holds_one_point_per_voxel_for_map_and_queries(points, query_voxel_m):
     sampled = GridSampling(0.4, query_voxel_m).sample(points)
     for chosen, among, size in ((sampled.points, points, 0.4), (queries(sampled), sampled.points, query_voxel_m)):
