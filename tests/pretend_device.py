@@ -69,16 +69,17 @@ class PretendDevice(TorchDispatchMode):
             kwargs["device"] = torch.device("cpu")
         if name == "copy_":
             is_there = isinstance(args[0], Elsewhere)
-        self._count(name, bool(there), is_there, bool(strangers))
+        is_mask = name in _INDEXES and any(operand.dtype == torch.bool for operand in operands[1:])
+        self._count(name, bool(there), is_there, bool(strangers), waits=is_mask or name in _WAITS)
         wrappers = {id(tensor.inner): tensor for tensor in there}
         result = func(*tree_map_only(Elsewhere, _inner, args), **tree_map_only(Elsewhere, _inner, kwargs))
         if not is_there:
             return result
         return tree_map_only(Tensor, lambda t: wrappers[id(t)] if id(t) in wrappers else Elsewhere(t), result)
 
-    def _count(self, name: str, was_there: bool, is_there: bool, has_strangers: bool) -> None:
+    def _count(self, name: str, was_there: bool, is_there: bool, has_strangers: bool, waits: bool) -> None:
         is_copy = name in _COPIES and (was_there != is_there or has_strangers)
-        if (was_there and name in _TO_THE_CPU | _WAITS) or is_copy:
+        if (was_there and (waits or name in _TO_THE_CPU)) or is_copy:
             self.transfers += 1
         elif (was_there or is_there) and name not in _VIEWS:
             self.launches += 1

@@ -10,7 +10,7 @@ from tests import pretend_device
 from tests.odometry.odometries import build, kd_at_least, poses, run, scans
 
 SCANS = 5
-LAUNCHES, TRANSFERS = 1500, 100  # at most, for a scan; about 10 ms on a GPU
+LAUNCHES, TRANSFERS = 1500, 100  # at most, for a scan
 
 
 def run_elsewhere(association: str) -> tuple[Tensor, int, int]:
