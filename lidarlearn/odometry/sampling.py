@@ -74,24 +74,24 @@ class Sampling(ABC):
 
 @dataclass(frozen=True)
 class GridSampling(Sampling):
-    """One point per voxel: fine for the map, as fine or coarser for the points to register.
+    """One point per voxel for the map; all of them, or one per wider voxel, are registered.
 
     Args:
         map_voxel_m: voxel edge for the map [m].
-        query_voxel_m: voxel edge for the points to register [m]; all of the map's, if it is no wider.
+        query_voxel_m: voxel edge for the points to register [m], no finer than the map's; None registers all.
 
     Source: Dellenbach et al. 2021, IV-A: 0.4 m.
     """
 
     map_voxel_m: float = 0.4
-    query_voxel_m: float = 0.6
+    query_voxel_m: float | None = None
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
         """One point of every voxel, drawn by `grid_sample`, in the order of the scan."""
         index = grid_sample(points, self.map_voxel_m)
         points = points[index]
         is_query = torch.ones(len(points), dtype=torch.bool, device=points.device)
-        if self.query_voxel_m > self.map_voxel_m:
+        if self.query_voxel_m is not None and self.query_voxel_m > self.map_voxel_m:
             is_query[:] = False
             is_query[grid_sample(points, self.query_voxel_m)] = True
         return SampledScan(points, None if times is None else times[index], is_query)

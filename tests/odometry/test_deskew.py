@@ -5,10 +5,12 @@ import torch
 from torch import Tensor
 
 from lidarlearn.geometry import se3
+from lidarlearn.metrics.absolute import ape_rmse
 from lidarlearn.odometry.deskew import deskew
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor
+from tests.odometry.odometries import build, kd_at_least, motion_errors, poses, run
 
 MOTION = se3.exp(torch.tensor([1.3, 0.1, -0.05, 0.01, -0.02, 0.09], dtype=torch.float64))
 QUIET = Sensor("quiet", tuple(float(e) for e in range(10, -20, -2)), 256, range_noise=0.0, drop_out=0.0, reach=math.inf)
@@ -59,3 +61,19 @@ def test_points_of_one_instant_move_together():
     points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
     half = se3.exp(0.5 * se3.log(MOTION))
     torch.testing.assert_close(deskew(points, torch.full((50,), 0.5), MOTION), se3.transform(half, points))
+
+
+@pytest.mark.parametrize(("world", "frames"), [("highway", 25), ("segway", 40)])
+@kd_at_least
+def test_deskewing_lowers_the_error_at_high_speed_and_when_the_sensor_swings(world, frames, association):
+    """On the Segway constant velocity alone gains nothing: no scan moves as the one before it."""
+    drive = Drive(world, seed=7, frames=frames, motion_distortion=True)
+    scans = [drive.scan(i) for i in range(frames)]
+    projection = "hdl64" if world == "highway" else "hdl32_inverted"
+    with_times, without = (build(f"cv+{association}_f2m", projection=projection) for _ in range(2))
+    deskewed = [with_times.register_scan(scan.points, scan.times) for scan in scans]
+    skewed = run(without, [scan.points for scan in scans])
+    errors, skewed_errors = (motion_errors(poses(frames), drive.T_world_lidar) for frames in (deskewed, skewed))
+    assert errors[0].mean() < 0.8 * skewed_errors[0].mean()
+    assert errors[1].mean() < 0.9 * skewed_errors[1].mean()
+    assert ape_rmse(poses(deskewed), drive.T_world_lidar) < 0.5 * ape_rmse(poses(skewed), drive.T_world_lidar)

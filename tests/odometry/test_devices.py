@@ -15,6 +15,7 @@ LAUNCHES, TRANSFERS = 1500, 100  # at most, for a scan
 
 def run_elsewhere(association: str) -> tuple[Tensor, int, int]:
     """Poses, and what the last scan asked of the device."""
+    torch.set_num_threads(1)  # as in the process that asks: sums are then equal to the bit
     with pretend_device.pretended() as device:
         odometry = build(f"cv+{association}_f2m", f"device={pretend_device.NAME}:0")
         *before, last = scans()[:SCANS]

@@ -28,10 +28,10 @@ def queries(sampled: SampledScan) -> torch.Tensor:
     return sampled.points[sampled.is_query]
 
 
-@pytest.mark.parametrize("query_voxel_m", [0.4, 0.6])
-def test_the_grid_holds_one_point_per_voxel_for_map_and_queries(points, query_voxel_m):
+@pytest.mark.parametrize(("query_voxel_m", "edge_m"), [(None, 0.4), (0.4, 0.4), (0.6, 0.6)])
+def test_the_grid_holds_one_point_per_voxel_for_map_and_queries(points, query_voxel_m, edge_m):
     sampled = GridSampling(0.4, query_voxel_m).sample(points)
-    for chosen, among, size in ((sampled.points, points, 0.4), (queries(sampled), sampled.points, query_voxel_m)):
+    for chosen, among, size in ((sampled.points, points, 0.4), (queries(sampled), sampled.points, edge_m)):
         cells = voxel_cells(chosen, size)
         assert len(cells.unique(dim=0)) == len(cells) == len(voxel_cells(among, size).unique(dim=0))
         assert rows(chosen) <= rows(among)
