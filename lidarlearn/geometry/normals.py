@@ -117,26 +117,32 @@ class _Moments:
 def _window_moments(channels: Float[Tensor, "3 batch h w"], window: tuple[int, int], max_range_jump: float) -> _Moments:
     rows, columns = window[0] // 2, window[1] // 2
     h, w = channels.shape[-2:]
-    ranges = channels.norm(dim=0, keepdim=True)
+    ranges = channels.norm(dim=0)
     ranges = torch.where(ranges > 0, ranges, torch.inf)  # an empty pixel is near to nothing, not even to another one
-    image = torch.cat([channels, ranges])
-    wrapped = pad(image, (columns, columns, 0, 0), mode="circular")
-    padded = pad(wrapped, (0, 0, rows, rows), value=torch.inf)
-    tolerance = max_range_jump * ranges[0]
+    neighbours, neighbours_ranges = _padded(channels, rows, columns, 0.0), _padded(ranges, rows, columns, torch.inf)
+    tolerance = max_range_jump * ranges
     counts, first, squares, products = (torch.zeros_like(channels) for _ in range(4))
     for row in range(2 * rows + 1):
         for column in range(2 * columns + 1):
             if (row, column) == (rows, columns):
                 continue
-            neighbour = padded[:, :, row : row + h, column : column + w]
-            used = (neighbour[3] - ranges[0]).abs() < tolerance
+            part = (..., slice(row, row + h), slice(column, column + w))
+            used = (neighbours_ranges[part] - ranges).abs_().lt_(tolerance)  # 1 or 0
             counts[0 if row == rows else 1 if column == columns else 2] += used
-            d = torch.where(used, neighbour[:3] - channels, 0.0)
+            d = (neighbours[part] - channels).mul_(used)
             first += d
             squares.addcmul_(d, d)
             products[:2].addcmul_(d[:1], d[1:])
             products[2].addcmul_(d[1], d[2])
     return _Moments(counts, first, squares, products)
+
+
+def _padded(
+    images: Float[Tensor, "*channels h w"], rows: int, columns: int, value: float
+) -> Float[Tensor, "*channels padded_h padded_w"]:
+    """Rows of a value above and below, columns from the other side of the seam."""
+    wrapped = torch.cat([images[..., images.shape[-1] - columns :], images, images[..., :columns]], dim=-1)
+    return pad(wrapped, (0, 0, rows, rows), value=value)
 
 
 _Symmetric = tuple[Tensor, ...]  # components xx, xy, xz, yy, yz, zz of symmetric 3x3 matrices

@@ -1,14 +1,15 @@
 """Spherical projection of a scan into an image, one nearest point per pixel."""
 
 import math
+import sys
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-# Marks a pixel into which no point fell: larger than any packed (range, index) key.
-_EMPTY = torch.iinfo(torch.int64).max
+_LOWER, _UPPER = (0, 1) if sys.byteorder == "little" else (1, 0)  # halves of a 64-bit integer
+_NOTHING = torch.iinfo(torch.int64).max  # its lower half is -1
 
 
 @dataclass(frozen=True)
@@ -53,20 +54,10 @@ class SphericalProjection:
         return torch.where(inside, row.int() * self.width + column, -1).long()
 
     def nearest_points(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch h w"]:
-        """Index into `points` of the nearest point of each pixel, -1 where no point fell.
-
-        Deterministic on every device: the minimum of (range, index) packed into one integer wins, so equal ranges go
-        to the smaller index, whatever the order of execution.
-        """
-        pixel = self.pixel_index(points)
-        n = points.shape[-2]
-        range_bits = points.detach().float().norm(dim=-1).view(torch.int32).long()  # ordered like the floats
-        key = (range_bits << 32) | torch.arange(n, device=points.device)
-        # Points outside go to one slot past the image.
-        pixel = torch.where(pixel < 0, self.pixels, pixel)
-        image = torch.full((*pixel.shape[:-1], self.pixels + 1), _EMPTY, device=points.device)
-        image = image.scatter_reduce(-1, pixel, key, "amin")[..., :-1]
-        index = torch.where(image == _EMPTY, -1, image & 0xFFFFFFFF)
+        """Index into `points` of the nearest point of each pixel, -1 where no point fell; see `nearest_per_slot`."""
+        # One slot more, in front, for the points that fall into no pixel.
+        slots = self.pixel_index(points).add_(1)
+        index = nearest_per_slot(slots, points.detach().float().norm(dim=-1), self.pixels + 1)[..., 1:].long()
         return index.unflatten(-1, (self.height, self.width))
 
     def vertex_map(self, points: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3 h w"]:
@@ -77,6 +68,27 @@ class SphericalProjection:
         gathered = points.gather(-2, index.clamp(min=0)[..., None].expand(*index.shape, 3))
         filled = torch.where((index >= 0)[..., None], gathered, 0.0)
         return filled.mT.unflatten(-1, (self.height, self.width))
+
+
+def nearest_per_slot(
+    slots: Int[Tensor, "*batch n"], ranges: Float[Tensor, "*batch n"], count: int
+) -> Int[Tensor, "*batch count"]:
+    """Index of the point with the smallest range among those of each slot, -1 where there are none; 32 bits.
+
+    Deterministic on every device: the minimum of (range, index) packed into one integer wins, so equal ranges go to
+    the smaller index, whatever the order of execution.
+
+    Args:
+        slots: of each point, from 0 to `count` - 1.
+        ranges: of each point, not negative; its square will do.
+        count: number of slots.
+    """
+    keys = torch.empty(*ranges.shape, 2, dtype=torch.int32, device=ranges.device)
+    keys[..., _UPPER] = ranges.view(torch.int32)  # ordered like the floats
+    keys[..., _LOWER] = torch.arange(ranges.shape[-1], dtype=torch.int32, device=ranges.device)
+    nearest = torch.full((*ranges.shape[:-1], count), _NOTHING, device=ranges.device)
+    nearest.scatter_reduce_(-1, slots, keys.view(torch.int64)[..., 0], "amin")
+    return nearest.view(torch.int32)[..., _LOWER::2]
 
 
 def activated(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Bool[Tensor, "*batch h w"]:
