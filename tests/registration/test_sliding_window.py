@@ -8,7 +8,8 @@ def test_the_last_scans_stand_behind_each_other_however_often_the_buffers_are_fu
     window, scans = SlidingWindow(torch.device("cpu")), []
     for length in torch.randint(0, 30_000, (40,), generator=generator).tolist():
         points = torch.randn(3, length, generator=generator)
-        window.push(points, -points.mT, scans=5)
+        window.forget(4)
+        window.push(points, -points.mT)
         scans = [*scans, points][-5:]
         assert len(window) == len(scans)
         assert torch.equal(window.coordinates, torch.cat(scans, dim=1))
@@ -20,6 +21,7 @@ def test_the_last_scans_stand_behind_each_other_however_often_the_buffers_are_fu
 def test_fewer_scans_can_be_kept_later_on():
     window = SlidingWindow(torch.device("cpu"))
     for scans in (3, 3, 3, 1):
-        window.push(torch.ones(3, 4) * scans, torch.zeros(4, 3), scans)
+        window.forget(scans - 1)
+        window.push(torch.ones(3, 4) * scans, torch.zeros(4, 3))
     assert len(window) == 1 and torch.equal(window.coordinates, torch.ones(3, 4))
     assert window.scans.tolist() == [0] * 4

@@ -1,8 +1,6 @@
 """The last k scans aggregated, one point per voxel, with normals that grow with the map.
 
-Points stand in the order in which they came, so forgetting the oldest scans moves the start of a slice and nothing
-else. Their coordinates lie apart in memory: distances to many points are computed axis by axis. A table maps voxels to
-points: a point lives for k scans, an occupied voxel takes no second one meanwhile.
+A table maps voxels to points: a point lives for k scans, an occupied voxel takes no second one meanwhile.
 """
 
 import functools
@@ -13,6 +11,7 @@ from torch import Tensor
 
 from lidarlearn.geometry.normals import fit_planes
 from lidarlearn.geometry.voxels import grid_sample, voxel_cells
+from lidarlearn.registration.association.sliding_window import SlidingWindow
 
 # The table wraps around in space: two voxels share a slot only if they are 512 (512, 64) cells apart, 205 m (26 m) at
 # 0.4 m, so neighbours never collide and stand side by side in memory.
@@ -22,7 +21,7 @@ _MAX_ROUGHNESS = 0.5  # deviation from the plane over the smaller extent in it
 _MIN_EXTENT = 0.15  # smaller extent in the plane over the voxel size: a line of points, as of one beam, has no normal
 
 
-class AggregatedPoints:
+class AggregatedPoints(SlidingWindow):
     """A growing and forgetting point cloud with one point per voxel, its normals kept up incrementally.
 
     Each point carries the moments of the points in the 26 voxels around it. A new point adds itself to the moments of
@@ -37,42 +36,19 @@ class AggregatedPoints:
 
     def __init__(self, voxel_size_m: float, device: torch.device) -> None:
         self.voxel_size_m = voxel_size_m
-        self._device = device
+        super().__init__(device)
         self._table = torch.full((1 << sum(_TABLE_BITS),), -1, dtype=torch.int32, device=device)
-        self._reserve(1 << 16)
-        self._start = self._end = 0
-        self._frame_starts: list[int] = []
-
-    @property
-    def points(self) -> Float[Tensor, "n 3"]:
-        """All points of the map [m], oldest first."""
-        return self.coordinates.mT
-
-    @property
-    def coordinates(self) -> Float[Tensor, "3 n"]:
-        """The same, each coordinate of all points in one piece."""
-        return self._coordinates[:, self._start : self._end]
-
-    @property
-    def normals(self) -> Float[Tensor, "n 3"]:
-        """Unit normals of the points, sign arbitrary; zero where the neighbourhood is no plane."""
-        return self._normals[self._start : self._end]
 
     def insert(self, points_world: Float[Tensor, "n 3"], frames: int) -> None:
         """Add the points that fall into free voxels as one scan; keep the last `frames` scans."""
-        self._forget(frames - 1)
+        self.forget(frames - 1)
         free = self.lookup(voxel_cells(points_world, self.voxel_size_m)) < 0
         points_world = points_world[free]
         points_world = points_world[grid_sample(points_world, self.voxel_size_m)]
-        if self._end + len(points_world) > len(self._cells):
-            self._compact(len(points_world))
-        new = slice(self._end, self._end + len(points_world))
         cells = voxel_cells(points_world, self.voxel_size_m)
-        self._coordinates[:, new] = points_world.mT
+        new = self._append(points_world.mT)
         self._cells[new] = cells
         self._table[_slots(cells)] = torch.arange(new.start, new.stop, dtype=torch.int32, device=self._device)
-        self._frame_starts.append(self._end)
-        self._end = new.stop
         self._update_moments(new)
 
     def lookup(self, cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
@@ -106,11 +82,6 @@ class AggregatedPoints:
             slots = slots[:, _cube(radius, self._device).abs().amax(dim=1) > inner]
         return self._table.index_select(0, slots.flatten()).view_as(slots)
 
-    def _forget(self, frames: int) -> None:
-        dropped = max(len(self._frame_starts) - frames, 0)
-        self._frame_starts = self._frame_starts[dropped:]
-        self._start = self._frame_starts[0] if self._frame_starts else self._end
-
     def _update_moments(self, new: slice) -> None:
         """Let the new points and their neighbours count each other, and refit the planes that changed."""
         cells = self._cells[new]
@@ -142,25 +113,19 @@ class AggregatedPoints:
         smallest_extent = _MIN_EXTENT * self.voxel_size_m
         self._normals[index] = plane.normals * _is_plane(moments[:, 0], plane.variances, smallest_extent)[:, None]
 
-    def _compact(self, needed: int) -> None:
-        """Move the living points to the front of buffers that hold at least twice their number."""
-        living = slice(self._start, self._end)
-        coordinates, rest = self.coordinates, (self._cells[living], self._moments[living], self._normals[living])
-        count = self._end - self._start
-        self._reserve(max(2 * (count + needed), len(self._cells)))
-        self._coordinates[:, :count] = coordinates
-        for buffer, content in zip((self._cells, self._moments, self._normals), rest, strict=True):
-            buffer[:count] = content
+    def _move_to_front(self, needed: int) -> None:
+        super()._move_to_front(needed)
         self._table.fill_(-1)
-        self._table[_slots(self._cells[:count])] = torch.arange(count, dtype=torch.int32, device=self._device)
-        self._frame_starts = [start - self._start for start in self._frame_starts]
-        self._start, self._end = 0, count
+        living = self._cells[: self._end]
+        self._table[_slots(living)] = torch.arange(len(living), dtype=torch.int32, device=self._device)
+
+    def _rows(self) -> tuple[Tensor, ...]:
+        return *super()._rows(), self._cells, self._moments
 
     def _reserve(self, capacity: int) -> None:
-        self._coordinates = torch.empty(3, capacity, device=self._device)
+        super()._reserve(capacity)
         self._cells = torch.empty(capacity, 3, dtype=torch.int64, device=self._device)
         self._moments = torch.empty(capacity, 10, device=self._device)
-        self._normals = torch.empty(capacity, 3, device=self._device)
 
 
 @functools.cache

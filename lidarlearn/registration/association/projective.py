@@ -38,7 +38,7 @@ class Projective(Association):
     @property
     def points(self) -> Float[Tensor, "m 3"]:
         """All points of the map [m], oldest first."""
-        return self._window.coordinates.mT
+        return self._window.points
 
     @property
     def normals(self) -> Float[Tensor, "m 3"]:
@@ -51,7 +51,8 @@ class Projective(Association):
         normals = normal_map(vertices)
         used = (normals != 0).any(dim=0) & activated(vertices)
         R = T_world_lidar[:3, :3].to(normals)
-        self._window.push(_moved(T_world_lidar, vertices[:, used]), (R @ normals[:, used]).mT, frames)
+        self._window.forget(frames - 1)
+        self._window.push(_moved(T_world_lidar, vertices[:, used]), (R @ normals[:, used]).mT)
         self._T_lidar_world = se3.inverse(T_world_lidar).to(vertices)
         self._layers = self._project()
 

@@ -8,8 +8,8 @@ from torch import Tensor
 class SlidingWindow:
     """Points and normals of the last scans, oldest first: a new scan is written behind the others, none is moved.
 
-    Coordinates lie apart in memory, as projections and distances like them. Only when the end of the buffers is
-    reached, once in many scans, what is left moves to their front.
+    Coordinates lie apart in memory: projections and distances are computed axis by axis. Forgetting moves the start of
+    a slice; only when the end of the buffers is reached, once in many scans, what is left moves to their front.
 
     Args:
         device: where the points are kept.
@@ -19,50 +19,68 @@ class SlidingWindow:
         self._device = device
         self._start = self._end = 0
         self._lengths: list[int] = []
-        self._dropped = 0
+        self._forgotten = 0
         self._reserve(1 << 16)
 
     @property
-    def coordinates(self) -> Float[Tensor, "3 n"]:
+    def points(self) -> Float[Tensor, "n 3"]:
         """All points [m]."""
+        return self.coordinates.mT
+
+    @property
+    def coordinates(self) -> Float[Tensor, "3 n"]:
+        """The same, each coordinate of all points in one piece."""
         return self._coordinates[:, self._start : self._end]
 
     @property
     def normals(self) -> Float[Tensor, "n 3"]:
-        """Their unit normals."""
+        """Their unit normals, zero where undefined."""
         return self._normals[self._start : self._end]
 
     @property
     def scans(self) -> Int[Tensor, "n"]:
         """Which scan each comes from, 0 for the oldest."""
-        return self._scans[self._start : self._end] - self._dropped
+        return self._scans[self._start : self._end] - self._forgotten
 
     def __len__(self) -> int:
         """Number of scans."""
         return len(self._lengths)
 
-    def push(self, coordinates: Float[Tensor, "3 m"], normals: Float[Tensor, "m 3"], scans: int) -> None:
-        """Add a scan and forget all but the last `scans` scans, this one included."""
-        while len(self._lengths) >= scans:
-            self._start += self._lengths.pop(0)
-            self._dropped += 1
-        if self._end + len(normals) > len(self._normals):
-            self._move_to_front(len(normals))
-        new = slice(self._end, self._end + len(normals))
-        self._coordinates[:, new] = coordinates
+    def push(self, coordinates: Float[Tensor, "3 m"], normals: Float[Tensor, "m 3"]) -> None:
+        """Add a scan."""
+        new = self._append(coordinates)
         self._normals[new] = normals
-        self._scans[new] = self._dropped + len(self._lengths)
-        self._lengths.append(len(normals))
+
+    def forget(self, scans: int) -> None:
+        """Keep the last `scans` scans at most."""
+        while len(self._lengths) > scans:
+            self._start += self._lengths.pop(0)
+            self._forgotten += 1
+
+    def _append(self, coordinates: Float[Tensor, "3 m"]) -> slice:
+        """Where the points of a new scan stand in the buffers."""
+        count = coordinates.shape[1]
+        if self._end + count > len(self._normals):
+            self._move_to_front(count)
+        new = slice(self._end, self._end + count)
+        self._coordinates[:, new] = coordinates
+        self._scans[new] = self._forgotten + len(self._lengths)
+        self._lengths.append(count)
         self._end = new.stop
+        return new
 
     def _move_to_front(self, needed: int) -> None:
         """Into buffers that hold at least twice as many."""
-        living = slice(self._start, self._end)
-        coordinates, normals, scans = self._coordinates[:, living], self._normals[living], self._scans[living]
-        count = len(normals)
+        living = [rows[self._start : self._end] for rows in self._rows()]
+        count = self._end - self._start
         self._reserve(max(2 * (count + needed), len(self._normals)))
-        self._coordinates[:, :count], self._normals[:count], self._scans[:count] = coordinates, normals, scans
+        for rows, content in zip(self._rows(), living, strict=True):
+            rows[:count] = content
         self._start, self._end = 0, count
+
+    def _rows(self) -> tuple[Tensor, ...]:
+        """The buffers, one row a point."""
+        return self._coordinates.mT, self._normals, self._scans
 
     def _reserve(self, capacity: int) -> None:
         self._coordinates = torch.empty(3, capacity, device=self._device)
