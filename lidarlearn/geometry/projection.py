@@ -45,13 +45,13 @@ class SphericalProjection:
         """Flat index row * width + column of each point's pixel; -1 outside the field of view and at the origin."""
         # Coordinates apart, in place, in 32 bits: a map of a million points is projected at the speed of the memory.
         x, y, z = points.detach().movedim(-1, 0).contiguous()
-        ground_range = (x * x).addcmul_(y, y).sqrt_()
+        ranges = (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
         column = torch.atan2(y, x).mul_(-self.width / (2 * math.pi)).add_(self.width / 2).int()
         column = torch.where(column < self.width, column, 0)
         fov_up, fov_down = math.radians(self.fov_up_deg), math.radians(self.fov_down_deg)
-        row = torch.atan2(z, ground_range).sub_(fov_up).mul_(-self.height / (fov_up - fov_down))
-        inside = (row >= 0) & (row < self.height) & ((ground_range > 0) | (z != 0))
-        return torch.where(inside, row.int() * self.width + column, -1).long()
+        row = torch.div(z, ranges).asin_().sub_(fov_up).mul_(-self.height / (fov_up - fov_down))
+        inside = (row >= 0).logical_and_(row < self.height)  # false at the origin, which has no elevation
+        return torch.where(inside, column.add_(row.int(), alpha=self.width), -1).long()
 
     def nearest_points(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch h w"]:
         """Index into `points` of the nearest point of each pixel, -1 where no point fell; see `nearest_per_slot`."""

@@ -81,10 +81,12 @@ class Odometry(ScanByScan):
         return Frame(self._T_world_lidar, health)
 
     def _in_range(self, points: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        ranges = points.norm(dim=1)
+        x, y, z = points.unbind(1)
+        ranges = (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
         valid = (ranges >= self._min_range_m) & (ranges <= self._max_range_m)  # false where not finite
-        points = points[valid].to(self._device)
-        return points, None if times is None else times[valid].to(self._device)
+        kept = valid.nonzero()[:, 0]
+        points = points.index_select(0, kept).to(self._device)
+        return points, None if times is None else times.index_select(0, kept).to(self._device)
 
     def _begin(self, scan: SampledScan) -> Health:
         """Start a map with a scan, at the origin or, after a loss, where the motion model puts it."""

@@ -99,7 +99,7 @@ class GridSampling(Sampling):
     query_voxel_m: float | None = None
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
-        """One point of every voxel, drawn by `grid_sample`, in the order of the scan."""
+        """One point of every voxel, drawn by `grid_sample`, in the order of the voxels."""
         index = grid_sample(points, self.map_voxel_m)
         points = points[index]
         is_query = torch.ones(len(points), dtype=torch.bool, device=points.device)

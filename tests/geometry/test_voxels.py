@@ -11,13 +11,12 @@ def random_points(n: int, scale: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("scale", "size"), [(1.0, 0.4), (20.0, 0.4), (20.0, 1.0), (80.0, 5.0)])
-def test_grid_sampling_keeps_one_point_of_every_voxel_in_the_order_of_the_scan(scale, size):
+def test_grid_sampling_keeps_one_point_of_every_voxel_in_the_order_of_the_voxels(scale, size):
     points = random_points(3000, scale)
     occupied = {tuple(math.floor(x) for x in (point / size).tolist()) for point in points}
     kept = grid_sample(points, size)
     cells = [tuple(math.floor(x) for x in (point / size).tolist()) for point in points[kept]]
-    assert len(cells) == len(occupied) and set(cells) == occupied
-    assert (kept.diff() > 0).all()
+    assert cells == sorted(occupied)
 
 
 def test_which_point_is_kept_does_not_depend_on_its_place_in_the_scan():
