@@ -7,6 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from lidarlearn.geometry.ranges import squared_ranges
+
 
 @dataclass(frozen=True)
 class PlaneFit:
@@ -75,7 +77,7 @@ def normal_map(
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood".
     """
     batch, (h, w) = vertex_map.shape[:-3], vertex_map.shape[-2:]
-    channels = vertex_map.reshape(-1, 3, h, w).transpose(0, 1)
+    channels = vertex_map.reshape(-1, 3, h, w).transpose(0, 1).contiguous()
     sums = _window_moments(channels, window, max_range_jump)
     beside, above, diagonal = sums.counts
     count = 1 + beside + above + diagonal
@@ -117,7 +119,7 @@ class _Moments:
 def _window_moments(channels: Float[Tensor, "3 batch h w"], window: tuple[int, int], max_range_jump: float) -> _Moments:
     rows, columns = window[0] // 2, window[1] // 2
     h, w = channels.shape[-2:]
-    ranges = channels.norm(dim=0)
+    ranges = squared_ranges(channels.movedim(0, -1)).sqrt_()
     ranges = torch.where(ranges > 0, ranges, torch.inf)  # an empty pixel is near to nothing, not even to another one
     neighbours, neighbours_ranges = _padded(channels, rows, columns, 0.0), _padded(ranges, rows, columns, torch.inf)
     tolerance = max_range_jump * ranges

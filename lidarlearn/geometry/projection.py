@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarlearn.geometry.ranges import squared_ranges
+
 _LOWER, _UPPER = (0, 1) if sys.byteorder == "little" else (1, 0)  # halves of a 64-bit integer
 _NOTHING = torch.iinfo(torch.int64).max  # its lower half is -1
 
@@ -42,22 +44,22 @@ class SphericalProjection:
         return self.height * self.width
 
     def pixel_index(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch n"]:
-        """Flat index row * width + column of each point's pixel; -1 outside the field of view and at the origin."""
+        """row * width + column of each point's pixel, of 32 bits; -1 outside the field of view and at the origin."""
         # Coordinates apart, in place, in 32 bits: a map of a million points is projected at the speed of the memory.
-        x, y, z = points.detach().movedim(-1, 0).contiguous()
-        ranges = (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
+        x, y, z = coordinates = points.detach().movedim(-1, 0).contiguous()
+        ranges = squared_ranges(coordinates.movedim(0, -1)).sqrt_()
         column = torch.atan2(y, x).mul_(-self.width / (2 * math.pi)).add_(self.width / 2).int()
         column = torch.where(column < self.width, column, 0)
         fov_up, fov_down = math.radians(self.fov_up_deg), math.radians(self.fov_down_deg)
         row = torch.div(z, ranges).asin_().sub_(fov_up).mul_(-self.height / (fov_up - fov_down))
         inside = (row >= 0).logical_and_(row < self.height)  # false at the origin, which has no elevation
-        return torch.where(inside, column.add_(row.int(), alpha=self.width), -1).long()
+        return torch.where(inside, column.add_(row.int(), alpha=self.width), -1)
 
     def nearest_points(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch h w"]:
         """Index into `points` of the nearest point of each pixel, -1 where no point fell; see `nearest_per_slot`."""
         # One slot more, in front, for the points that fall into no pixel.
         slots = self.pixel_index(points).add_(1)
-        index = nearest_per_slot(slots, points.detach().float().norm(dim=-1), self.pixels + 1)[..., 1:].long()
+        index = nearest_per_slot(slots, squared_ranges(points.detach().float()), self.pixels + 1)[..., 1:].long()
         return index.unflatten(-1, (self.height, self.width))
 
     def vertex_map(self, points: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3 h w"]:
@@ -87,7 +89,7 @@ def nearest_per_slot(
     keys[..., _UPPER] = ranges.view(torch.int32)  # ordered like the floats
     keys[..., _LOWER] = torch.arange(ranges.shape[-1], dtype=torch.int32, device=ranges.device)
     nearest = torch.full((*ranges.shape[:-1], count), _NOTHING, device=ranges.device)
-    nearest.scatter_reduce_(-1, slots, keys.view(torch.int64)[..., 0], "amin")
+    nearest.scatter_reduce_(-1, slots.long(), keys.view(torch.int64)[..., 0], "amin")
     return nearest.view(torch.int32)[..., _LOWER::2]
 
 

@@ -41,13 +41,20 @@ def nearest_two(
     """Compare the candidates of each point.
 
     Args:
-        coordinates: map points [m], their coordinates apart in memory: distances are summed up axis by axis.
+        coordinates: map points [m], their coordinates apart in memory, as a slice of a longer buffer, too.
         candidates: indices of map points.
         points: the points [m].
         usable: which candidates count, all of them if not given.
     """
-    offsets = coordinates.index_select(1, candidates.flatten()).unflatten(1, candidates.shape) - points.mT[..., None]
-    squared = offsets.square_().sum(0)
+    # Axis by axis: of all three at once `index_select` would first copy a slice of a buffer.
+    flat = candidates.flatten()
+    offsets = (
+        axis.index_select(0, flat).view_as(candidates).sub_(own[:, None])
+        for axis, own in zip(coordinates, points.mT, strict=True)
+    )
+    squared = next(offsets).square_()
+    for offset in offsets:
+        squared.addcmul_(offset, offset)
     if usable is not None:
         squared.masked_fill_(~usable, torch.inf)
     nearest = squared.argmin(dim=1, keepdim=True)

@@ -6,7 +6,8 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.normals import normal_map
-from lidarlearn.geometry.projection import SphericalProjection, activated, nearest_per_slot
+from lidarlearn.geometry.projection import SphericalProjection, nearest_per_slot
+from lidarlearn.geometry.ranges import squared_ranges
 from lidarlearn.registration.association.base import Association, Neighbours
 from lidarlearn.registration.association.candidates import nearest_two
 from lidarlearn.registration.association.sliding_window import SlidingWindow
@@ -49,10 +50,11 @@ class Projective(Association):
         """Add a registered scan and project the whole map into its image."""
         vertices = self.projection.vertex_map(points)
         normals = normal_map(vertices)
-        used = (normals != 0).any(dim=0) & activated(vertices)
+        used = (normals != 0).any(dim=0).flatten().nonzero()[:, 0]
         R = T_world_lidar[:3, :3].to(normals)
         self._window.forget(frames - 1)
-        self._window.push(_moved(T_world_lidar, vertices[:, used]), (R @ normals[:, used]).mT)
+        vertices, normals = (image.flatten(1).index_select(1, used) for image in (vertices, normals))
+        self._window.push(_moved(T_world_lidar, vertices), (R @ normals).mT)
         self._T_lidar_world = se3.inverse(T_world_lidar).to(vertices)
         self._layers = self._project()
 
@@ -72,12 +74,11 @@ class Projective(Association):
 
     def _project(self) -> Int[Tensor, "pixels scans"]:
         """Index of the nearest point of each scan in each pixel, -1 where there is none."""
-        x, y, z = local = _moved(self._T_lidar_world, self._window.coordinates)
-        squared_ranges = (x * x).addcmul_(y, y).addcmul_(z, z)
+        local = _moved(self._T_lidar_world, self._window.coordinates).mT
         scans, pixels = len(self._window), self.projection.pixels
         # One pixel more, in front, for the points that fall into none.
-        slots = self.projection.pixel_index(local.mT).add_(1).mul_(scans).add_(self._window.scans)
-        nearest = nearest_per_slot(slots, squared_ranges, (pixels + 1) * scans)
+        slots = self.projection.pixel_index(local).add_(1).mul_(scans).add_(self._window.scans)
+        nearest = nearest_per_slot(slots, squared_ranges(local), (pixels + 1) * scans)
         return nearest[scans:].unflatten(0, (pixels, scans))
 
 
