@@ -22,12 +22,12 @@ def poses() -> Tensor:
     return maps.drive("street").T_world_lidar
 
 
-def slow_search(frames: list[tuple[Tensor, Tensor]], T_world_last: Tensor, query: Tensor) -> Tensor | None:
-    """The paper's words: every frame projected into the last scan's image; of the query's pixel, the closest in 3D.
+def slow_search(frames: list[tuple[Tensor, Tensor]], T_world_image: Tensor, query: Tensor) -> Tensor | None:
+    """The paper's words: every frame projected into the image of one scan; of the query's pixel, the closest in 3D.
 
     `frames` holds the points with normals of each scan, and its pose.
     """
-    T_lidar_world = se3.inverse(T_world_last)
+    T_lidar_world = se3.inverse(T_world_image)
     pixel = SMALL.pixel_index(se3.transform(T_lidar_world, query[None]))[0]
     best, smallest = None, math.inf
     for points, T_world in frames:
@@ -41,17 +41,22 @@ def slow_search(frames: list[tuple[Tensor, Tensor]], T_world_last: Tensor, query
     return best
 
 
-def test_agrees_with_the_words_of_the_paper(scans):
-    association, frames = Projective(SMALL), []
-    for i in range(3):
-        association.insert(scans[i], poses()[i], frames=30)
+@pytest.mark.parametrize(
+    ("image_distance_m", "inserted", "frames", "image"),
+    [(0.0, 3, 30, 2), (0.0, 4, 2, 3), (100.0, 4, 2, 1)],
+    ids=["every scan begins an image", "the oldest are forgotten", "scans are added to an image from near by"],
+)
+def test_agrees_with_the_words_of_the_paper(scans, image_distance_m, inserted, frames, image):
+    association, kept = Projective(SMALL, image_distance_m=image_distance_m), []
+    for i in range(inserted):
+        association.insert(scans[i], poses()[i], frames)
         vertices = SMALL.vertex_map(scans[i])
-        frames.append((vertices[:, (normal_map(vertices) != 0).any(dim=0)].T, poses()[i]))
+        kept.append((vertices[:, (normal_map(vertices) != 0).any(dim=0)].T, poses()[i]))
     queries = se3.transform(poses()[3], scans[3][::97])
     found = association.search(queries, 2.0)
     agreeing = 0
     for i, query in enumerate(queries):
-        expected = slow_search(frames, poses()[2], query)
+        expected = slow_search(kept[-frames:], poses()[image], query)
         if expected is None or (expected - query).norm() > 2.0:
             agreeing += not found.mask[i]
         else:
@@ -93,6 +98,25 @@ def test_more_scans_find_closer_points(scans):
     both = a.mask & b.mask
     closer = (b.points - queries)[both].norm(dim=1) <= (a.points - queries)[both].norm(dim=1) + 1e-5
     assert closer.all()
+
+
+@pytest.mark.parametrize(
+    ("xi", "begins"),
+    [
+        pytest.param((1.9, 0, 0, 0, 0, 0), False, id="near"),
+        pytest.param((2.1, 0, 0, 0, 0, 0), True, id="far"),
+        pytest.param((0, 0, 0, 0, 0.03, 0), True, id="tilted"),
+        pytest.param((0, 0, 0, 0, 0, 2.0), False, id="turned"),
+    ],
+)
+def test_an_image_lasts_until_the_sensor_is_elsewhere_or_tilted(scans, xi, begins):
+    association = Projective(SMALL, image_distance_m=2.0)
+    T_world_lidar = se3.exp(torch.tensor(xi, dtype=torch.float64))
+    for T in (se3.identity(), se3.identity(), T_world_lidar):
+        association.insert(scans[0], T, frames=2)
+    ahead = torch.tensor([[10.0, 0.0, -1.0]])
+    seen_from = T_world_lidar if begins else se3.identity()
+    assert torch.equal(association.places(se3.transform(seen_from, ahead)), SMALL.pixel_index(ahead))
 
 
 def test_out_of_view_is_not_associated(scans):

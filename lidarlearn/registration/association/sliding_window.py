@@ -37,11 +37,6 @@ class SlidingWindow:
         """Their unit normals, zero where undefined."""
         return self._normals[self._start : self._end]
 
-    @property
-    def scans(self) -> Int[Tensor, "n"]:
-        """Which scan each comes from, 0 for the oldest."""
-        return self._scans[self._start : self._end] - self._forgotten
-
     def __len__(self) -> int:
         """Number of scans."""
         return len(self._lengths)
@@ -51,11 +46,19 @@ class SlidingWindow:
         new = self._append(coordinates)
         self._normals[new] = normals
 
-    def forget(self, scans: int) -> None:
-        """Keep the last `scans` scans at most."""
+    def last(self, scans: int) -> tuple[Float[Tensor, "3 m"], Int[Tensor, "m"]]:
+        """Coordinates of the points of the last scans, and which scan each comes from, 0 for the oldest of these."""
+        points = slice(self._end - sum(self._lengths[-scans:]), self._end)
+        first = self._forgotten + len(self._lengths) - scans
+        return self._coordinates[:, points], self._scans[points] - first
+
+    def forget(self, scans: int) -> int:
+        """Keep the last `scans` scans at most; returns how many points are forgotten."""
+        start = self._start
         while len(self._lengths) > scans:
             self._start += self._lengths.pop(0)
             self._forgotten += 1
+        return self._start - start
 
     def _append(self, coordinates: Float[Tensor, "3 m"]) -> slice:
         """Where the points of a new scan stand in the buffers."""
