@@ -37,10 +37,10 @@ def assert_no_failure(frames: list[Frame], true: Tensor) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("association", "mean_rpe_m", "ape_m"), [("kd", 0.0227, 0.030), ("vh", 0.0227, 0.030), ("p", 0.018, 0.045)]
+    ("association", "mean_rpe_m", "ape_m"), [("kd", 0.0185, 0.030), ("vh", 0.0185, 0.030), ("p", 0.018, 0.045)]
 )
 def test_kitti_04(real_data, association, mean_rpe_m, ape_m, record_property):
-    """The bound on the RPE of kd and vh is what KISS-ICP 1.3.0 reaches on the same scans."""
+    """Kd and VH measure 1.78 cm. KISS-ICP 1.3.0 on the same scans: mean RPE 2.2 cm, APE 0.026 m."""
     sequence, scans = opened("kitti_00-08", real_data / "kitti_odometry", "04")
     true = sequence.T_world_lidar[: len(scans)]
     frames = run(build(f"cv+{association}_f2m"), [scan.points for scan in scans])
@@ -121,9 +121,11 @@ def test_turning_pairs_of_kitti_00(real_data, association, pair):
 
 @all_associations
 def test_the_pair_of_an_hdl_32(real_data, association):
-    """Measured: 1.7 cm and 0.26-0.29 deg, in roll, and the same in all associations, forwards and backwards.
+    """Measured: 1.0-1.6 cm and 0.26-0.27 deg, in roll, and the same in all associations, forwards and backwards.
 
-    On the grid of 0.8 m that a drive with 32 beams needs: 3.2-3.5 cm and 0.5 deg.
+    The truth that comes with the pair is itself a registration: small_gicp's GICP on a grid of 0.1 m returns it to
+    0.001 deg, on one of 0.25 m it is 0.33 deg off. Our grids from 0.1 to 0.4 m are 0.25 to 0.30 deg off, that of 0.8 m,
+    which a drive with 32 beams needs, 0.5 deg and 3.2-3.5 cm.
     """
     folder = real_data / "hdl32_pair"
     true = se3.orthonormalize(as_transforms(torch.from_numpy(np.loadtxt(folder / "T_target_source.txt"))[:3]))

@@ -78,7 +78,7 @@ class Projective(Association):
             self._layers -= forgotten  # negative indices are no points, and the oldest layer holds nothing else now
             new = self._project(1)[:, 0]
             self._layers[:, self._oldest_layer] = torch.where(new < 0, -1, new + (len(self.points) - len(used)))
-            self._oldest_layer = (self._oldest_layer + 1) % len(self._window)
+            self._oldest_layer = (self._oldest_layer + 1) % self._layers.shape[1]
 
     def places(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
         """The pixel of each point, -1 outside the image."""
@@ -110,7 +110,7 @@ class Projective(Association):
         # One pixel more, in front, for the points that fall into none.
         slots = self.projection.pixel_index(local).add_(1).mul_(scans).add_(layers)
         nearest = nearest_per_slot(slots, squared_ranges(local), (self.projection.pixels + 1) * scans)
-        return nearest[scans:].unflatten(0, (self.projection.pixels, scans))
+        return nearest[scans:].unflatten(0, (self.projection.pixels, scans)).contiguous()
 
 
 def _moved(T: Float[Tensor, "4 4"], coordinates: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
