@@ -5,12 +5,11 @@ from types import ModuleType
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from lidarlearn.errors import UserError
+from lidarlearn.geometry import se3
 from lidarlearn.odometry.health import Health
-from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
+from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, as_scan
 
 
 class KissIcp(ScanByScan):
@@ -36,14 +35,19 @@ class KissIcp(ScanByScan):
         self._odometry = KissICP(config)
         self._frames = 0
 
-    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
-        """Its pose of the scan; without times, nothing is deskewed."""
+    def register_scan(self, points: Points, times: Times | None = None) -> Frame:
+        """Its pose at the instant that times are relative to; without times, nothing is deskewed."""
+        points, times = as_scan(points, times)
         used = points.isfinite().all(dim=1)
-        stamps = np.zeros(0) if times is None else (times[used].double().numpy() + 0.5)
-        self._odometry.register_frame(points[used].double().cpu().numpy(), stamps)
+        stamps = torch.zeros(0) if times is None else times[used]
+        self._odometry.register_frame(points[used].double().cpu().numpy(), stamps.double().cpu().numpy())
+        T_world_lidar = torch.from_numpy(self._odometry.last_pose.copy())
+        if len(stamps):  # deskewed, its pose is that of the last point
+            motion = se3.log(torch.from_numpy(self._odometry.last_delta.copy()))
+            T_world_lidar = se3.orthonormalize(T_world_lidar @ se3.exp(-stamps.max().item() * motion))
         health = Health(self._frames, initialization="kiss_icp", points=int(used.sum()))
         self._frames += 1
-        return Frame(torch.from_numpy(self._odometry.last_pose.copy()), health)
+        return Frame(T_world_lidar, health)
 
 
 class SmallGicp(ScanByScan):
@@ -68,8 +72,9 @@ class SmallGicp(ScanByScan):
         self._T_world_lidar, self._motion = np.eye(4), np.eye(4)
         self._frames = 0
 
-    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+    def register_scan(self, points: Points, times: Times | None = None) -> Frame:
         """Its pose of the scan; times are not used. A scan without points moves on as the last one did."""
+        points, times = as_scan(points, times)
         used = points[points.isfinite().all(dim=1)].double().cpu().numpy()
         guess = self._T_world_lidar @ self._motion
         if len(used):

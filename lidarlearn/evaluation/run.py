@@ -155,17 +155,17 @@ class RunProgress:
 
 
 def summarize_health(records: Iterable[Health]) -> dict[str, float | int | None]:
-    """Counts of what was flagged, and means, over a sequence; the first frame registers nothing and is left out."""
-    registered = list(records)[1:]
+    """Counts of what was flagged over a sequence, and means over the scans that were registered."""
+    every = list(records)
     return {
-        "flagged": sum(h.flagged for h in registered),
-        "recovered": sum(h.status == "recovered" for h in registered),
-        "coasted": sum(h.status in ("coasted", "restarted") for h in registered),
-        "degenerate": sum(h.degenerate for h in registered),
-        "implausible": sum(h.implausible for h in registered),
-        "mean_iterations": _mean([h.iterations for h in registered]),
-        "mean_inlier_share": _mean([h.inlier_share for h in registered]),
-        "mean_rmse_m": _mean([h.rmse_m for h in registered]),
+        "flagged": sum(h.flagged for h in every),
+        "recovered": sum(h.status == "recovered" for h in every),
+        "coasted": sum(h.status in ("coasted", "restarted") for h in every),
+        "degenerate": sum(h.degenerate for h in every),
+        "implausible": sum(h.implausible for h in every),
+        "mean_iterations": _mean(h.iterations for h in every),
+        "mean_inlier_share": _mean(h.inlier_share for h in every),
+        "mean_rmse_m": _mean(h.rmse_m for h in every),
     }
 
 
@@ -189,5 +189,6 @@ def _write(
     draft.replace(export.summary)
 
 
-def _mean(values: list[int] | list[float]) -> float | None:
-    return statistics.fmean(values) if values else None
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known else None

@@ -11,7 +11,7 @@ Status = Literal["ok", "recovered", "coasted", "restarted"]
 
 @dataclass(frozen=True)
 class Health:
-    """What is known about the registration of one scan.
+    """What is known about the registration of one scan; None where nothing was registered.
 
     Args:
         frame: index of the scan.
@@ -36,16 +36,16 @@ class Health:
     status: Status = "ok"
     initialization: str = "start"
     points: int = 0
-    iterations: int = 0
-    converged: bool = True
-    overlap: float = 1.0
-    inlier_share: float = 1.0
-    rmse_m: float = 0.0
-    min_information: float = 1.0
+    iterations: int | None = None
+    converged: bool | None = None
+    overlap: float | None = None
+    inlier_share: float | None = None
+    rmse_m: float | None = None
+    min_information: float | None = None
     degenerate: bool = False
-    weakest_direction: tuple[float, ...] = (0.0, 0.0, 0.0)
-    deviation_m: float = 0.0
-    deviation_deg: float = 0.0
+    weakest_direction: tuple[float, ...] | None = None
+    deviation_m: float | None = None
+    deviation_deg: float | None = None
     implausible: bool = False
 
     @property
@@ -58,14 +58,14 @@ _AXES = ("x", "y", "z")
 
 
 def write_health(path: Path, records: Iterable[Health]) -> None:
-    """Write one row per frame as CSV; the weakest direction takes three columns."""
+    """Write one row per frame as CSV, cells empty where nothing is known; the weakest direction takes three columns."""
     names = [f.name for f in fields(Health) if f.name != "weakest_direction"]
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*names, "flagged", *(f"weakest_{axis}" for axis in _AXES)])
         for record in records:
             row = asdict(record)
-            direction = row.pop("weakest_direction")
+            direction = row.pop("weakest_direction") or (None,) * len(_AXES)
             writer.writerow([*(_cell(row[n]) for n in names), record.flagged, *(_cell(v) for v in direction)])
 
 

@@ -14,7 +14,7 @@ class LocalMap:
         association: the searchable map that holds the scans.
         size: number of scans in the window.
         key_frame_distance_m: a scan is added once the sensor moved this far from the last one added [m]...
-        key_frame_angle_deg: ...or turned by this angle [deg]. With both 0 every scan is added.
+        key_frame_angle_deg: ...or turned by this angle [deg]. 0 switches one of them off, 0 for both adds every scan.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood": k = 30.
     """
@@ -49,4 +49,6 @@ class LocalMap:
         if self._T_world_key is None:
             return True
         moved = motion_difference(self._T_world_key, T_world_lidar)
-        return moved.distance_m >= self._key_frame_distance_m or moved.angle_deg >= self._key_frame_angle_deg
+        is_far = moved.distance_m >= self._key_frame_distance_m > 0
+        is_turned = moved.angle_deg >= self._key_frame_angle_deg > 0
+        return is_far or is_turned or self._key_frame_distance_m == self._key_frame_angle_deg == 0

@@ -13,10 +13,10 @@ from lidarlearn.geometry.ranges import squared_ranges
 from lidarlearn.odometry.backend import Backend
 from lidarlearn.odometry.health import Health, Status
 from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
-from lidarlearn.odometry.initialization.base import Initialization
+from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
 from lidarlearn.odometry.judgement import Judgement, motion_difference
 from lidarlearn.odometry.sampling import SampledScan
-from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
+from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, as_scan
 from lidarlearn.registration.gauss_newton import RegistrationResult
 
 _SEARCHED_M = 0.5  # how far off a motion may be that was found among several
@@ -57,27 +57,26 @@ class Odometry(ScanByScan):
         self._T_world_lidar = se3.identity()
         self._motion = se3.identity()  # last one that was trusted
         self._doubted_motion: Tensor | None = None
-        self._first: SampledScan | None = None  # until the motion within it is known
+        self._first: SampledScan | None = None  # the map's only scan, as long as no other was registered to it
         self._surprises_m: deque[float] = deque(maxlen=5)
         self._fits: deque[float] = deque(maxlen=5)
         self._frames = 0
         self._coasting = 0
 
     @torch.no_grad()
-    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+    def register_scan(self, points: Points, times: Times | None = None) -> Frame:
         """Guess the motion, register, judge, try again if in doubt, add the scan to the map."""
-        points, times = self._in_range(points, times)
+        points, times = self._in_range(*as_scan(points, times))
         guess = self._initialization.predict(points, self._motion)
         scan = self._backend.sampling.sample(points, times)
         if self._backend.local_map.association.is_empty:
             health = self._begin(scan)
+        elif not self._has_enough_points(scan):
+            health = self._coast(self._unregistered(scan, guess.source))
+        elif self._first is not None:
+            health = self._set_off(scan, self._first, guess)
         else:
-            T_previous_new, source = guess.T_previous_new, guess.source
-            if self._frames == 1:
-                if self._recovery:
-                    T_previous_new, source = self._search(scan, start_motions()), "start"
-                self._deskew_first(scan, T_previous_new, source)
-            health = self._advance(scan, T_previous_new, source)
+            health = self._advance(scan, guess.T_previous_new, guess.source)
         self._frames += 1
         return Frame(self._T_world_lidar, health)
 
@@ -90,20 +89,28 @@ class Odometry(ScanByScan):
 
     def _begin(self, scan: SampledScan) -> Health:
         """Start a map with a scan, at the origin or, after a loss, where the motion model puts it."""
-        status: Status = "ok" if self._frames == 0 else "restarted"
         if self._frames:
             self._move(self._motion)
+        status: Status = "ok" if self._frames == 0 else "restarted"
         if self._has_enough_points(scan):
             self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
             self._first = scan
             self._coasting = 0
-        return Health(self._frames, status=status, points=len(scan.points))
+        else:
+            status = "coasted"
+        return replace(self._unregistered(scan, "start"), status=status)
 
-    def _deskew_first(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> None:
+    def _set_off(self, scan: SampledScan, first: SampledScan, guess: InitialMotion) -> Health:
+        """Register a scan to the only one there is, from motions of all kinds: none has been seen yet."""
+        T_previous_new, source = guess.T_previous_new, guess.source
+        if self._recovery:
+            T_previous_new, source = self._search(scan, start_motions(T_previous_new)), "start"
+        if first.times is not None:
+            self._deskew_first(first, scan, T_previous_new, source)
+        return self._advance(scan, T_previous_new, source)
+
+    def _deskew_first(self, first: SampledScan, scan: SampledScan, T_previous_new: Tensor, source: str) -> None:
         """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the poses."""
-        first, self._first = self._first, None
-        if first is None or first.times is None or not self._has_enough_points(scan):
-            return
         result = self._register(scan, T_previous_new, source)
         if self._judgement.accepts(result):
             self._backend.local_map.restart()
@@ -111,16 +118,10 @@ class Odometry(ScanByScan):
 
     def _advance(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> Health:
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
-        if not self._has_enough_points(scan):
-            return self._coast(Health(self._frames, initialization=source, points=len(scan.points), overlap=0.0))
         result = self._register(scan, T_previous_new, source)
         health = self._assess(scan, result, source)
         if self._recovery and source != "start" and self._is_doubtful(result, health):
-            hypotheses = surprise_motions(T_previous_new, self._motion)
-            second = self._register(scan, self._search(scan, hypotheses), "recovery")
-            if self._agreement(scan, second) > self._agreement(scan, result):
-                result, health = second, self._assess(scan, second, "recovery")
-            health = replace(health, status="recovered")
+            result, health = self._try_others(scan, T_previous_new, result, health)
         if not self._judgement.accepts(result):
             return self._coast(health)
         self._fits.append(result.fit.item())
@@ -128,8 +129,20 @@ class Odometry(ScanByScan):
         self._surprises_m.append(_displacement_m(scan, T_previous_new, motion))
         self._trust(motion, health)
         self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
+        self._first = None
         self._coasting = 0
         return health
+
+    def _try_others(
+        self, scan: SampledScan, T_guess: Tensor, result: RegistrationResult, health: Health
+    ) -> tuple[RegistrationResult, Health]:
+        """The better of a doubtful registration and the best from other motions; a leap must be clearly better."""
+        other = self._register(scan, self._search(scan, surprise_motions(T_guess, self._motion)), "recovery")
+        other_health = self._assess(scan, other, "recovery")
+        needed = self._judgement.min_gain if other_health.implausible else 0.0
+        if self._agreement(scan, other) - self._agreement(scan, result) > needed:
+            result, health = other, other_health
+        return result, replace(health, status="recovered")
 
     def _is_doubtful(self, result: RegistrationResult, health: Health) -> bool:
         fits_as_before = result.fit.item() >= self._judgement.min_fit_share * max(self._fits, default=0.0)
@@ -159,7 +172,7 @@ class Odometry(ScanByScan):
         self._move(motion)
         doubted, self._doubted_motion = self._doubted_motion, None
         confirmed = doubted is not None and self._judgement.is_plausible(motion_difference(doubted, motion))
-        if self._frames == 1 or not health.implausible or confirmed:
+        if self._first is not None or not health.implausible or confirmed:
             self._motion = motion
         else:
             self._doubted_motion = motion
@@ -184,8 +197,11 @@ class Odometry(ScanByScan):
             weakest_direction=tuple(result.weakest_direction.tolist()),
             deviation_m=deviation.distance_m,
             deviation_deg=deviation.angle_deg,
-            implausible=self._frames > 1 and not self._judgement.is_plausible(deviation),
+            implausible=self._first is None and not self._judgement.is_plausible(deviation),
         )
+
+    def _unregistered(self, scan: SampledScan, source: str) -> Health:
+        return Health(self._frames, initialization=source, points=int(scan.is_query.sum()))
 
     def _has_enough_points(self, scan: SampledScan) -> bool:
         return int(scan.is_query.sum()) >= self._judgement.min_points

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,18 +26,41 @@ class Frame:
     health: Health
 
 
+# On any device, of any number type; shapes are checked by `as_scan`, for these come from users.
+Points = Tensor | np.ndarray
+Times = Tensor | np.ndarray
+
+
 class ScanByScan(ABC):
     """Anything that takes scans in order and says where they were taken."""
 
     @abstractmethod
-    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+    def register_scan(self, points: Points, times: Times | None = None) -> Frame:
         """Find the pose of the next scan.
 
         Args:
-            points: the scan [m], in the sensor's frame; may be empty or hold values that are not finite.
-            times: when each point was measured, to compensate the motion within the scan; see
+            points: the scan (n, 3) [m], in the sensor's frame; may be empty or hold values that are not finite.
+            times: when each point was measured (n,), to compensate the motion within the scan; see
                 `lidarlearn.data.sequence.Scan`. None where there is nothing to compensate.
+
+        Raises:
+            ValueError: the points are not (n, 3), or there are more or fewer times than points.
         """
+
+
+def as_scan(
+    points: Points, times: Times | None, device: torch.device | None = None
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"] | None]:
+    """Points and times as float32 tensors, moved to a device if one is given; see `ScanByScan.register_scan`."""
+    points = torch.as_tensor(points, dtype=torch.float32, device=device)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"register_scan: points must be (n, 3), x y z [m], but are {tuple(points.shape)}")
+    if times is None:
+        return points, None
+    times = torch.as_tensor(times, dtype=torch.float32, device=device)
+    if times.shape != points.shape[:1]:
+        raise ValueError(f"register_scan: times must be ({len(points)},) as the points, but are {tuple(times.shape)}")
+    return points, times
 
 
 class InitializationAlone(ScanByScan):
@@ -54,9 +78,9 @@ class InitializationAlone(ScanByScan):
         self._T_world_lidar = se3.identity()
         self._frames = 0
 
-    def register_scan(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> Frame:
+    def register_scan(self, points: Points, times: Times | None = None) -> Frame:
         """The previous pose and the guessed motion."""
-        points = points.to(self._device)
+        points, _ = as_scan(points, times, self._device)
         guess = self._initialization.predict(points[points.isfinite().all(dim=1)], self._motion)
         if self._frames:
             self._motion = guess.T_previous_new

@@ -107,19 +107,20 @@ def test_sequences_without_time_stamps_and_without_truth_are_exported(tmp_path):
     assert poses[:, 0, 3].tolist() == [0, 1, 2]
 
 
-def test_the_summary_counts_what_was_flagged_after_the_first_scan():
+def test_the_summary_counts_what_was_flagged_and_means_are_over_what_was_registered():
     records = [
-        Health(0, status="coasted"),
+        Health(0),
         Health(1, iterations=4, rmse_m=0.02, inlier_share=0.9),
         Health(2, status="recovered", implausible=True, iterations=8, rmse_m=0.04, inlier_share=0.7),
-        Health(3, status="coasted", degenerate=True, iterations=0, rmse_m=0.0, inlier_share=0.5),
-        Health(4, status="restarted", iterations=0, rmse_m=0.0, inlier_share=0.5),
+        Health(3, status="coasted", degenerate=True, iterations=9, rmse_m=0.06, inlier_share=0.5),
+        Health(4, status="coasted"),
+        Health(5, status="restarted"),
     ]
     summary = summarize_health(records)
-    assert summary["flagged"] == 3 and summary["recovered"] == 1 and summary["coasted"] == 2
+    assert summary["flagged"] == 4 and summary["recovered"] == 1 and summary["coasted"] == 3
     assert summary["degenerate"] == 1 and summary["implausible"] == 1
-    assert summary["mean_iterations"] == 3 and summary["mean_rmse_m"] == pytest.approx(0.015)
-    assert summary["mean_inlier_share"] == pytest.approx(0.65)
+    assert summary["mean_iterations"] == 7 and summary["mean_rmse_m"] == pytest.approx(0.04)
+    assert summary["mean_inlier_share"] == pytest.approx(0.7)
 
 
 def test_means_over_nothing_are_none():

@@ -7,7 +7,18 @@ import torch
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from tests.odometry.odometries import FRAMES, build, kd_at_least, motion_errors, poses, run, scans, slow, street
+from tests.odometry.odometries import (
+    FRAMES,
+    build,
+    kd_at_least,
+    motion_errors,
+    poses,
+    run,
+    scans,
+    scans_of,
+    slow,
+    street,
+)
 
 AT = 5  # the frame that is disturbed
 
@@ -97,11 +108,24 @@ def test_a_world_turned_for_good_is_followed(association):
 
 
 @kd_at_least
+@pytest.mark.parametrize("step_m", [1.2, 2.7])
 @pytest.mark.parametrize("lead", [pytest.param(1, marks=slow), 3])
-def test_a_drive_that_begins_with_empty_scans_starts_when_there_is_something_to_see(association, lead):
-    frames = run(build(f"cv+{association}_f2m"), [*[torch.zeros(0, 3)] * lead, *scans()[:6]])
+def test_a_drive_that_begins_with_empty_scans_starts_when_there_is_something_to_see(association, lead, step_m):
+    drive = street(step=step_m)
+    frames = run(build(f"cv+{association}_f2m"), [*[torch.zeros(0, 3)] * lead, *scans_of(drive)[:6]])
     assert torch.isfinite(poses(frames)).all()
-    translations, _ = motion_errors(poses(frames)[lead:], street().T_world_lidar[:6])
+    assert [frame.health.status for frame in frames] == [*["coasted"] * lead, "restarted", *["ok"] * 5]
+    translations, _ = motion_errors(poses(frames)[lead:], drive.T_world_lidar[:6])
+    assert translations.max() < 0.03
+
+
+@kd_at_least
+def test_a_vehicle_that_has_set_off_during_a_gap_is_found_driving(association):
+    drive = street(step=2.4)
+    standing, *driving = scans_of(drive)[:6]
+    frames = run(build(f"cv+{association}_f2m"), [*[standing] * 3, *[torch.zeros(0, 3)] * 6, *driving])
+    assert frames[9].health.status == "restarted"
+    translations, _ = motion_errors(poses(frames)[9:], drive.T_world_lidar[1:6])
     assert translations.max() < 0.03
 
 

@@ -1,6 +1,7 @@
 """Poses live on the CPU, points on the device of the odometry, and little passes between them."""
 
 import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 import torch
@@ -28,8 +29,8 @@ def run_elsewhere(association: str) -> tuple[Tensor, int, int]:
 @pytest.mark.skipif(not pretend_device.IS_SUPPORTED, reason="needs a more recent torch")
 @kd_at_least
 def test_nothing_is_left_on_another_device(association):
-    with multiprocessing.get_context("spawn").Pool(1) as process:
-        elsewhere, launches, transfers = process.apply(run_elsewhere, (association,))
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        elsewhere, launches, transfers = process.submit(run_elsewhere, association).result()
     here = poses(run(build(f"cv+{association}_f2m"), scans()[:SCANS]))
     assert torch.equal(elsewhere, here)
     assert 0 < launches < LAUNCHES and 0 < transfers < TRANSFERS

@@ -21,6 +21,7 @@ def test_one_row_per_frame_with_every_field(tmp_path):
     assert float(rows[1]["rmse_m"]) == pytest.approx(0.0234567891, rel=1e-5)
     assert [float(rows[2][f"weakest_{axis}"]) for axis in "xyz"] == [1.0, -0.25, 0.0]
     assert float(rows[2]["min_information"]) == 1e-4
+    assert {rows[0][name] for name in ("iterations", "converged", "overlap", "rmse_m", "weakest_x")} == {""}
     assert {"initialization", "points", "iterations", "converged", "overlap", "inlier_share"} <= set(rows[0])
     assert {"degenerate", "implausible", "deviation_m", "deviation_deg"} <= set(rows[0])
 

@@ -12,13 +12,18 @@ def contains(motions: torch.Tensor, wanted: torch.Tensor) -> bool:
 
 
 def test_the_start_tries_standing_driving_and_turning():
-    motions = start_motions()
+    motions = start_motions(se3.identity())
     assert contains(motions, se3.identity())
     xi = se3.log(motions)
     assert xi[:, 0].max() >= 3.0 and xi[:, 0].min() < 0  # 108 km/h at 10 Hz, and backwards
     assert xi[:, 5].max().rad2deg() >= 20 and xi[:, 5].min().rad2deg() <= -20
     forward = xi[xi[:, 5] == 0, 0].sort().values
     assert forward.diff().max() <= 1.0  # no speed is farther from a hypothesis than ICP pulls in
+
+
+def test_the_start_tries_the_guess_too_but_nothing_twice():
+    assert contains(start_motions(GUESS), GUESS)
+    assert len(start_motions(GUESS)) == len(start_motions(se3.identity())) + 1
 
 
 def test_a_surprise_tries_the_guess_the_last_motion_a_lost_and_a_repeated_scan():
@@ -30,6 +35,6 @@ def test_a_surprise_tries_the_guess_the_last_motion_a_lost_and_a_repeated_scan()
 
 
 def test_hypotheses_are_rigid_motions():
-    for motions in (start_motions(), surprise_motions(GUESS, FORWARD)):
+    for motions in (start_motions(GUESS), surprise_motions(GUESS, FORWARD)):
         assert motions.dtype == torch.float64
         torch.testing.assert_close(se3.orthonormalize(motions), motions)

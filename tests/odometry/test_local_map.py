@@ -54,6 +54,18 @@ def test_key_frames_are_taken_by_distance_or_by_angle_since_the_last_one():
     assert [x for x, _ in searchable.inserted] == [0.0, 1.1, 1.2, 1.3]
 
 
+@pytest.mark.parametrize(
+    ("setting", "kept"),
+    [({"key_frame_distance_m": 1.0}, [0.0, 1.1, 2.2]), ({"key_frame_angle_deg": 10.0}, [0.0, 1.2])],
+)
+def test_key_frames_by_one_criterion_alone(setting, kept):
+    searchable = Recorder()
+    local_map = LocalMap(searchable, **setting)
+    for x, yaw in [(0.0, 0.0), (0.6, 0.0), (1.1, 9.0), (1.2, 12.0), (2.2, 12.0)]:
+        local_map.update(POINT, pose(x, yaw))
+    assert [x for x, _ in searchable.inserted] == kept
+
+
 def test_a_restarted_map_takes_the_next_scan_whatever_the_key_frames():
     searchable = Recorder()
     local_map = LocalMap(searchable, key_frame_distance_m=100.0, key_frame_angle_deg=100.0)

@@ -1,6 +1,6 @@
 """Whole odometries, as configured, on generated drives: accurate from the first frame on."""
 
-from dataclasses import replace
+import math
 from functools import cache
 
 import pytest
@@ -72,6 +72,15 @@ def test_a_drive_that_begins_on_a_motorway_is_not_taken_to_stand_still(associati
     assert translations.max() < 0.05
 
 
+@pytest.mark.parametrize("association", ["kd", pytest.param("vh", marks=slow), pytest.param("p", marks=slow)])
+def test_on_a_motorway_the_previous_scan_alone_does_not_draw_to_rest(association):
+    """Where few points have a partner, standing still agrees a little better with the rings than driving."""
+    drive, scans = first_scans("highway", 7, 12)
+    frames = run(build(f"cv+{association}_f2f"), scans)
+    translations, _ = motion_errors(poses(frames), drive.T_world_lidar[:12])
+    assert translations.max() < 0.1
+
+
 @slow
 @pytest.mark.parametrize("association", ["kd", "vh"])
 def test_the_swinging_pitch_of_a_segway_is_followed_with_32_beams(association):
@@ -141,10 +150,31 @@ def test_returns_of_the_vehicle_itself_and_beyond_the_range_are_left_out():
 
 
 def test_without_recovery_a_surprise_is_still_flagged():
-    odometry = build("cv+kd_f2m", "pipeline.recovery=false")
-    frames = run(odometry, [scans()[0], scans()[0], *[torch.zeros(0, 3)] * 2])
-    assert [frame.health.status for frame in frames[2:]] == ["coasted"] * 2
-    assert replace(frames[1].health, iterations=0) != frames[1].health
+    T_straight_turned = se3.from_euler(torch.tensor([0, 0, 0, 0, 0, math.radians(20)], dtype=torch.float64))
+    turned = se3.transform(se3.inverse(T_straight_turned), scans()[5])
+    frames = run(build("cv+kd_f2m", "pipeline.recovery=false"), [*scans()[:5], turned, torch.zeros(0, 3)])
+    assert [frame.health.flagged for frame in frames] == [*[False] * 5, True, True]
+    assert frames[5].health.initialization == "cv" and frames[6].health.status == "coasted"
+
+
+@pytest.mark.parametrize(
+    ("points", "times", "said"),
+    [
+        (torch.zeros(5, 4), None, r"points must be \(n, 3\).*\(5, 4\)"),
+        (torch.zeros(3), None, r"points must be \(n, 3\).*\(3,\)"),
+        (torch.zeros(5, 3), torch.zeros(4), r"times must be \(5,\).*\(4,\)"),
+    ],
+)
+@pytest.mark.parametrize("method", ["cv+kd_f2m", "ei"])
+def test_what_is_no_scan_is_refused(method, points, times, said):
+    with pytest.raises(ValueError, match=said):
+        build(method).register_scan(points, times)
+
+
+def test_scans_may_be_arrays_of_any_number_type():
+    as_float32 = run(build("cv+kd_f2m"), scans()[:4])
+    as_arrays = run(build("cv+kd_f2m"), [points.double().numpy() for points in scans()[:4]])
+    assert torch.equal(poses(as_float32), poses(as_arrays))
 
 
 @pytest.mark.gpu

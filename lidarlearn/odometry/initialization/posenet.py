@@ -9,6 +9,7 @@ from torch import Tensor
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
+from lidarlearn.odometry.initialization.constant_velocity import ConstantVelocity
 
 
 @runtime_checkable
@@ -36,9 +37,12 @@ class PoseNetInitialization(Initialization):
         self._previous: Tensor | None = None
 
     def predict(self, points: Float[Tensor, "n 3"], last_motion: Float[Tensor, "4 4"]) -> InitialMotion:
-        """The network's estimate; the identity for the first scan."""
+        """The network's estimate; the identity for the first scan; constant velocity where it is not finite."""
         vertices = self._network.projection.vertex_map(points.to(self._network.device))[None]
         previous, self._previous = self._previous, vertices
         if previous is None:
             return InitialMotion(se3.identity(), "posenet")
-        return InitialMotion(self._network.relative_pose(previous, vertices)[0].cpu(), "posenet")
+        T_previous_new = self._network.relative_pose(previous, vertices)[0].cpu()
+        if not T_previous_new.isfinite().all():
+            return ConstantVelocity().predict(points, last_motion)
+        return InitialMotion(T_previous_new, "posenet")
