@@ -20,14 +20,14 @@ from benchmarks import report
 from benchmarks.report import column
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.data import compose_data_set
-from lidarlearn.commands.evaluate import build_odometry
-from lidarlearn.evaluation.methods import BASELINES, parse_method
+from lidarlearn.commands.evaluate import build_odometry, configured_method
 from lidarlearn.metrics.absolute import ape_rmse
 from lidarlearn.metrics.relative import relative_errors
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import hdl64
 
 _LARGEST_RPE_CM = 3.0
+BASELINES = ("kiss_icp", "small_gicp")
 METHODS = ("cv+kd_f2m", "cv+vh_f2m", "cv+p_f2m")
 Runner = Callable[[list[Tensor]], Tensor]  # scans to poses T_world_lidar
 
@@ -51,7 +51,7 @@ def runner(method: str, device: torch.device) -> Runner:
         config = compose("evaluate", ["projection@data.projection=hdl64", f"device={device}"])
 
     def run(scans: list[Tensor]) -> Tensor:
-        odometry = build_odometry(config, parse_method(method))
+        odometry = build_odometry(config, configured_method(config, method))
         return torch.stack([odometry.register_scan(points).T_world_lidar for points in scans])
 
     return run

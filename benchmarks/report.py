@@ -2,18 +2,22 @@
 
 import argparse
 import json
+import os
 import platform
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from traceback import format_exc
 from typing import Any
 
 import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from lidarlearn.errors import UserError
 
 _PACKAGES = ("torch", "kiss-icp", "small-gicp", "open3d")
 
@@ -59,9 +63,9 @@ def main(description: str | None, **benchmarks: Benchmark) -> None:
     for name, measure in benchmarks.items():
         try:
             rows = measure(options)
-        except BenchmarkError as error:
-            rows = error.rows
-            failures.append(f"{name}: {error}")
+        except Exception as error:
+            rows = error.rows if isinstance(error, BenchmarkError) else ()
+            failures.append(f"{name}: {error}" if isinstance(error, (BenchmarkError, UserError)) else format_exc())
         show(name, rows)
         tables[name] = [asdict(row) for row in rows]
         if arguments.json is not None:
@@ -85,14 +89,22 @@ class BenchmarkError(Exception):
 
 def about(options: Options) -> dict[str, Any]:
     """Where the figures come from."""
-    device = torch.cuda.get_device_name() if options.device.type == "cuda" else platform.processor() or "cpu"
-    found = {"python": platform.python_version(), "platform": platform.platform(), "device": device}
+    device = torch.cuda.get_device_name() if options.device.type == "cuda" else "cpu"
+    found = {"python": platform.python_version(), "platform": platform.platform(), "device": device, "cpu": _cpu()}
     for package in _PACKAGES:
         try:
             found[package] = version(package)
         except PackageNotFoundError:
             found[package] = "not installed"
-    return {**found, "threads": torch.get_num_threads()}
+    return {**found, "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+
+
+def _cpu() -> str:
+    """Name of the processor; Linux tells it here alone."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or "unknown"
 
 
 def show(title: str, rows: Rows) -> None:

@@ -24,13 +24,13 @@ from lidarlearn.commands.run_folder import code_digest, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.layout import TableLayout
-from lidarlearn.evaluation.methods import BASELINES, Method, parse_method
+from lidarlearn.evaluation.methods import Method, parse_method
 from lidarlearn.evaluation.plots import figures, write_plots
 from lidarlearn.evaluation.report import print_tables, report_tables, sequences_trained_on, write_report
 from lidarlearn.evaluation.run import Export, RunProgress, read_export, run_odometry
 from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.submission import is_kitti_test_set, write_submission
-from lidarlearn.evaluation.trajectories import find_trajectories, read_trajectory, to_lidar_frame
+from lidarlearn.evaluation.trajectories import find_trajectories, lidar_poses, read_trajectory
 from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
 from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.parts import require_trusted
@@ -141,11 +141,15 @@ def _foreign(config: DictConfig, sequences: Mapping[str, Sequence]) -> Iterator[
     for method, files in found.items():
         for name, path in files.items():
             sequence = sequences[name]
-            poses = read_trajectory(path, sequence.timestamps)
-            T_world_lidar = to_lidar_frame(
-                poses, config.trajectories_frame, sequence.reference_frame, sequence.T_reference_lidar
-            )
+            T_world = read_trajectory(path, sequence.timestamps)
+            T_world_lidar = lidar_poses(T_world, config.trajectories_frame, sequence, path)
             yield score(method, T_world_lidar, sequence), T_world_lidar
+
+
+def configured_method(config: DictConfig, name: str) -> Method:
+    """The method of a name, of the parts that the configuration has; see `parse_method`."""
+    initializations = dict.fromkeys([*config.initialization, *config.networks])
+    return parse_method(name, initializations, list(config.odometry), list(config.baseline))
 
 
 def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
@@ -153,7 +157,7 @@ def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
 
     A network is built from `initialization.posenet`, with the checkpoint that `networks` has under its name.
     """
-    if method.initialization in BASELINES:
+    if method.initialization in config.baseline:
         return instantiate(config.baseline[method.initialization])
     if method.initialization in config.networks:
         network = {"path": config.networks[method.initialization]}
@@ -177,7 +181,7 @@ def _methods(config: DictConfig) -> list[Method]:
     if names is None:
         names = _WITH_NETWORK if config.ckpt else _WITHOUT_NETWORK
     names = [str(name) for name in ([names] if isinstance(names, str) else names)]
-    methods = [parse_method(name, config.networks) for name in names]
+    methods = [configured_method(config, name) for name in names]
     for method in () if config.trajectories else methods:
         network = method.initialization
         if network in config.networks and config.networks[network] is None:

@@ -65,7 +65,8 @@ def measure_convergence(config: DictConfig) -> None:
         for name in config.backends:
             task = progress.add_task(f"{name} on {sequence.name}", total=len(sequence))
             backend = instantiate(config.odometry[name])
-            basins[name] = convergence_basin(backend, sequence, probe, partial(progress.advance, task))
+            advance = partial(progress.advance, task)
+            basins[name] = convergence_basin(backend, sequence, probe, config.device, advance)
             progress.remove_task(task)
     (folder / "convergence.json").write_text(json.dumps({k: asdict(v) for k, v in basins.items()}, indent=2) + "\n")
     print_tables(basin_tables(basins))

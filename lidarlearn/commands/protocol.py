@@ -11,14 +11,14 @@ from omegaconf import DictConfig, OmegaConf
 import lidarlearn
 from lidarlearn.commands.run_folder import git_revision
 from lidarlearn.data.sequence import Sequence
-from lidarlearn.evaluation.methods import BASELINES, Method
+from lidarlearn.evaluation.methods import Method
 from lidarlearn.training.checkpoints import load_checkpoint, sha256
 
 
 def method_settings(config: DictConfig, method: Method) -> dict[str, Any]:
     """All of the configuration that a method's result depends on, beside the scans."""
     settings: dict[str, Any] = {"deskew": config.data.deskew, "seed": config.seed, "device": config.device}
-    if method.initialization in BASELINES:
+    if method.initialization in config.baseline:
         parts = {"baseline": config.baseline[method.initialization]}
     else:
         own = "posenet" if method.initialization in config.networks else method.initialization

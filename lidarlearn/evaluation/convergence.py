@@ -15,6 +15,7 @@ from lidarlearn.errors import UserError
 from lidarlearn.evaluation.plots import Panel, curves_figure
 from lidarlearn.evaluation.tables import Table
 from lidarlearn.geometry import se3
+from lidarlearn.geometry.ranges import in_range
 from lidarlearn.odometry.backend import Backend
 
 _AT_ONCE = 8  # initial poses registered together, which bounds the memory
@@ -61,7 +62,11 @@ class Basin:
 
 
 def convergence_basin(
-    backend: Backend, sequence: Sequence, probe: Probe, advance: Callable[[], None] = lambda: None
+    backend: Backend,
+    sequence: Sequence,
+    probe: Probe,
+    device: torch.device | str = "cpu",
+    advance: Callable[[], None] = lambda: None,
 ) -> Basin:
     """Register scans from wrong initial poses, against a map of the scans before them at their true poses.
 
@@ -69,6 +74,7 @@ def convergence_basin(
         backend: a fresh one.
         sequence: with ground truth.
         probe: what is tried.
+        device: where the backend's map is.
         advance: called after each scan.
 
     Raises:
@@ -83,9 +89,8 @@ def convergence_basin(
     successes = torch.zeros(len(T_error))
     scans = 0
     for i, scan in enumerate(sequence):
-        ranges = scan.points.norm(dim=1)
-        points = scan.points[(ranges >= probe.min_range_m) & (ranges <= probe.max_range_m)]
-        sampled = backend.sampling.sample(points)
+        near_enough = in_range(scan.points, probe.min_range_m, probe.max_range_m)
+        sampled = backend.sampling.sample(scan.points[near_enough].to(device))
         if i and i % probe.every == 0:
             normals = backend.normals(sampled.points, sampled.is_query)
             queries = sampled.points[sampled.is_query]

@@ -64,7 +64,7 @@ class TableLayout:
         if any("*" in cell for row in rows for cell in row):
             notes.append("*: the network was trained on these sequences.")
         if any("(" in cell for row in rows for cell in row[1:]):
-            notes.append("(n of m): only so many of the sequences were run.")
+            notes.append("(n of m): only so many of the sequences were run and are long enough for the figure.")
         return Table(self.title, ("method", *self.columns), tuple(rows), tuple(reference), tuple(notes),
                      lowest=frozenset(range(1, len(self.columns) + 1)))  # fmt: skip
 
@@ -76,13 +76,12 @@ class TableLayout:
         trained_on: Mapping[str, Collection[str]],
         digits: int,
     ) -> str:
-        rows = [row for row in scores if row.method == method and row.sequence in names]
+        of_method = [row for row in scores if row.method == method and row.sequence in names]
+        rows = [row for row in of_method if getattr(row, self.figure) is not None]
         if not rows:
             return "-"
         mean: MeanOverSequences = average_scores(rows)[0].mean_over_sequences
         value = getattr(mean, self.figure)
-        if value is None:
-            return "-"
         seen = set(names) <= set(trained_on.get(network_of(method), ()))
         partly = f" ({len(rows)} of {len(names)})" if len(rows) < len(names) else ""
         return f"{value:.{digits}f}{'*' if seen else ''}{partly}"

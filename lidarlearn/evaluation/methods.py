@@ -5,10 +5,6 @@ from dataclasses import dataclass
 
 from lidarlearn.errors import UserError
 
-INITIALIZATIONS = ("ni", "cv", "ei", "posenet")
-BACKENDS = tuple(f"{association}_{map_}" for association in ("p", "kd", "vh") for map_ in ("f2f", "f2m"))
-BASELINES = ("kiss_icp", "small_gicp")
-
 
 @dataclass(frozen=True)
 class Method:
@@ -26,25 +22,29 @@ class Method:
         return self.initialization if self.backend is None else f"{self.initialization}+{self.backend}"
 
 
-def parse_method(name: str, networks: Collection[str] = ()) -> Method:
+def parse_method(
+    name: str, initializations: Collection[str], backends: Collection[str], baselines: Collection[str] = ()
+) -> Method:
     """The method of a name such as "cv+kd_f2m" or "posenet", in any case.
 
     Args:
         name: as on the command line.
-        networks: names of networks, each an initialization of its own beside "posenet".
+        initializations: names of those that there are, networks included.
+        backends: names of those that there are.
+        baselines: names of those that there are.
 
     Raises:
         UserError: there is no such method.
     """
-    initialization, plus, backend = name.lower().partition("+")
-    initializations = dict.fromkeys((*INITIALIZATIONS, *networks))
-    if name.lower() in BASELINES:
-        return Method(name.lower())
-    if initialization not in initializations or (plus and backend not in BACKENDS):
+    known = {known.lower(): known for known in (*initializations, *backends, *baselines)}
+    first, plus, second = (known.get(part, part) for part in name.lower().partition("+"))
+    if first in baselines and not plus:
+        return Method(first)
+    if first not in initializations or (plus and second not in backends):
         raise UserError(
             f"methods: there is no method '{name}'.\n"
             f"  change: <initialization>+<association>_<map>, e.g. cv+kd_f2m, or an initialization alone; "
-            f"initializations are {', '.join(initializations)}, the rest is one of {', '.join(BACKENDS)}; "
-            f"for comparison there are {', '.join(BASELINES)}"
+            f"initializations are {', '.join(initializations)}, the rest is one of {', '.join(backends)}; "
+            f"for comparison there are {', '.join(baselines)}"
         )
-    return Method(initialization, backend if plus else None)
+    return Method(first, second if plus else None)

@@ -172,6 +172,8 @@ def figures(
     """
     for name, sequence in sequences.items():
         estimates = {method: poses[name] for method, poses in T_world_lidar.items() if name in poses}
+        if not estimates:
+            continue  # an error came first
         yield f"trajectories_{name}", trajectory_figure(f"sequence {name}", sequence.T_world_lidar, estimates)
         if sequence.T_world_lidar is not None and len(sequence) > 1:
             yield f"frame_errors_{name}", frame_error_figure(f"sequence {name}", sequence.T_world_lidar, estimates)

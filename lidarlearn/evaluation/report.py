@@ -20,6 +20,15 @@ _UNDEFINED = "-"
 _PIPE_WIDTH = 200  # characters, where there is no terminal to ask
 
 
+_DETAILS_NOTES = {
+    "rot. [deg/100 m]": "rot.: average rotation error, KITTI metric.",
+    "APE [m]": "APE: position after rigid alignment of the whole trajectory, RMSE.",
+    "RPE [cm]": "RPE: motion between consecutive scans, RMSE unless it says mean.",
+    "motion [%]": "motion: mean error of that motion over its mean length.",
+    "fails": "fails: registration failures, motions off by more than 1 m or 3 deg.",
+    "flagged": "flagged: scans whose pose the odometry itself doubts, see the .health.csv files.",
+}
+
 TrainedOn = Mapping[str, Collection[str]]
 _NO_NETWORK: TrainedOn = {}
 
@@ -64,7 +73,7 @@ def write_results(folder: Path, results: Mapping[str, Any], tables: Series[Table
 def sequences_trained_on(protocol: Mapping[str, Any]) -> TrainedOn:
     """Which sequences each network of a protocol was trained on, by the network's name in methods."""
     networks = {"posenet": protocol.get("checkpoint"), **protocol.get("networks", {})}
-    return {name: network["trained_on"]["train_sequences"] for name, network in networks.items() if network}
+    return {name: network["trained_on"]["train_sequences"] or () for name, network in networks.items() if network}
 
 
 def results_content(scores: Series[Score]) -> dict[str, Any]:
@@ -87,14 +96,16 @@ def report_tables(
 ) -> list[Table]:
     """The experiment's table; the paper's kind of table, a column a sequence; then everything else, a row each.
 
-    Arguments as for `write_report`, `data` being the name of the data group.
+    Without any ground truth the last alone. Arguments as for `write_report`, `data` being the name of the data group.
     """
-    tables = [drift_table(data, scores, trained_on), details_table(scores)]
+    tables = [details_table(scores)]
+    if any(row.path_length_m is not None for row in scores):
+        tables.insert(0, drift_table(data, scores, trained_on))
     return tables if layout is None else [layout.table(scores, trained_on), *tables]
 
 
 def drift_table(data: str, scores: Series[Score], trained_on: TrainedOn = _NO_NETWORK) -> Table:
-    """Average translation error of each method on each sequence and both averages, with published rows where due."""
+    """Average translation error of each method on each sequence, both averages of several, published rows where due."""
     sequences = list(dict.fromkeys(row.sequence for row in scores))
     cells = {(row.method, row.sequence): _drift_cell(row, trained_on) for row in scores}
     averages = average_scores(scores)
@@ -104,21 +115,24 @@ def drift_table(data: str, scores: Series[Score], trained_on: TrainedOn = _NO_NE
         for row in averages
     ]
     reference = _reference_rows(data, scores, sequences)
+    columns = ("method", *sequences, "mean of sequences", "mean of segments")
+    shown = slice(len(columns) if len(sequences) > 1 else -2)  # the means of one sequence are its own figure
     return Table(
         title="Average translation error [%], KITTI metric",
-        columns=("method", *sequences, "mean of sequences", "mean of segments"),
-        rows=tuple(rows),
-        reference=tuple(reference),
+        columns=columns[shown],
+        rows=tuple(row[shown] for row in rows),
+        reference=tuple(row[shown] for row in reference),
         notes=tuple(_drift_notes(scores, rows, bool(reference))),
-        lowest=frozenset(range(1, len(sequences) + 3)),
+        lowest=frozenset(range(1, len(columns[shown]))),
     )
 
 
 def details_table(scores: Series[Score]) -> Table:
-    """Every other figure, one row for each method and sequence."""
+    """Every other figure that is defined for any, one row for each method and sequence."""
     columns: dict[str, Callable[[Score], str]] = {
         "method": lambda row: row.method,
         "sequence": lambda row: row.sequence,
+        "scans": lambda row: str(row.frames),
         "path [m]": lambda row: _text(row.path_length_m, 1),
         "rot. [deg/100 m]": lambda row: _text(row.avg_rotation_error_deg_per_100m, 3),
         "APE [m]": lambda row: _text(row.ape_rmse_m, 3),
@@ -127,19 +141,17 @@ def details_table(scores: Series[Score]) -> Table:
         "RPE [deg]": lambda row: _text(row.rpe_rotation_deg, 3),
         "motion [%]": lambda row: _text(row.relative_translation_error_percent, 2),
         "fails": lambda row: _text(row.registration_failures, 0),
+        "flagged": lambda row: _text(row.health.get("flagged"), 0),
         "scans/s": lambda row: _text(row.frames_per_second, 1),
     }
+    cells = {heading: [cell(row) for row in scores] for heading, cell in columns.items()}
+    cells = {heading: column for heading, column in cells.items() if set(column) != {_UNDEFINED}}
+    notes = [note for heading, note in _DETAILS_NOTES.items() if heading in cells]
     return Table(
-        title="Further errors, and speed",
-        columns=tuple(columns),
-        rows=tuple(tuple(cell(row) for cell in columns.values()) for row in scores),
-        notes=(
-            "rot.: average rotation error, KITTI metric. "
-            "APE: position after rigid alignment of the whole trajectory, RMSE. "
-            "RPE: motion between consecutive scans, RMSE unless it says mean. "
-            "motion: mean error of that motion over its mean length. "
-            "fails: registration failures, motions off by more than 1 m or 3 deg. -: not defined.",
-        ),
+        title="Further errors, and speed" if "path [m]" in cells else "Scans, and speed: there is no ground truth",
+        columns=tuple(cells),
+        rows=tuple(zip(*cells.values(), strict=True)),
+        notes=(" ".join(notes),) if notes else (),
         labels=2,
     )
 
@@ -178,10 +190,12 @@ def _reference_rows(data: str, scores: Series[Score], sequences: Series[str]) ->
 
 
 def _drift_notes(scores: Series[Score], rows: Series[tuple[str, ...]], has_reference: bool) -> list[str]:
-    notes = [
-        "Mean over segments of 100 to 800 m. Two averages are in use: every sequence counts the same (mean of "
-        "sequences), or every segment of all sequences (mean of segments), as on the KITTI benchmark."
-    ]
+    notes = ["Mean over segments of 100 to 800 m."]
+    if len({row.sequence for row in scores}) > 1:
+        notes[0] += (
+            " Two averages are in use: every sequence counts the same (mean of sequences), or every segment of all "
+            "sequences (mean of segments), as on the KITTI benchmark."
+        )
     if any(row.segments == 0 for row in scores):
         notes.append(
             "- (x cm): the drive holds no segment of 100 m, so the metric is not defined; in brackets the mean "

@@ -59,6 +59,11 @@ class Export:
         """The settings of the run, its speed, the summary of the health records; written last."""
         return self.folder / f"{self.sequence}.json"
 
+    def remove(self) -> None:
+        """Remove the files that there are."""
+        for path in (self.summary, self.kitti, self.tum, self.health):
+            path.unlink(missing_ok=True)
+
     def settings(self) -> dict[str, Any] | None:
         """The settings with which a whole run was exported; None where there is none."""
         if not (self.summary.is_file() and self.kitti.is_file()):
@@ -76,8 +81,8 @@ def run_odometry(
 ) -> None:
     """Feed a sequence to an odometry and export trajectory, health records and speed.
 
-    Reading scans is not part of the speed. Where a scan cannot be read, what came before it is exported, under names
-    that end in `.partial`, before the error goes on.
+    Reading scans is not part of the speed. Where a scan cannot be read, or the run is interrupted, what came before is
+    exported, under names that end in `.partial`, before the error goes on. Files of an earlier run are removed first.
 
     Args:
         odometry: a fresh one.
@@ -87,7 +92,9 @@ def run_odometry(
         advance: called after each scan.
         settings: all that the result depends on, kept with it; plain values, lists and mappings.
     """
-    export.summary.unlink(missing_ok=True)
+    partial = Export(export.folder, f"{export.sequence}.partial")
+    export.remove()
+    partial.remove()
     poses: list[Tensor] = []
     records: list[Health] = []
     seconds = 0.0
@@ -99,9 +106,9 @@ def run_odometry(
             poses.append(frame.T_world_lidar)
             records.append(frame.health)
             advance()
-    except UserError:
+    except (UserError, KeyboardInterrupt):
         if poses:
-            _write(Export(export.folder, f"{export.sequence}.partial"), sequence, poses, records, seconds, settings)
+            _write(partial, sequence, poses, records, seconds, settings)
         raise
     _write(export, sequence, poses, records, seconds, settings)
 

@@ -17,8 +17,6 @@ from lidarlearn.metrics.failures import registration_failures
 from lidarlearn.metrics.kitti import SegmentAverage
 from lidarlearn.metrics.relative import relative_pose_error, relative_translation_error
 
-_SCAN_PERIOD_S = 0.1  # of a spinning LiDAR, where a sequence has no time stamps
-
 Number = TypeVar("Number", int, float)
 
 
@@ -134,7 +132,7 @@ def score(
         )
     T_world_estimate = to_reference_frame(T_world_lidar, sequence.T_reference_lidar)
     T_world_true = to_reference_frame(T_true, sequence.T_reference_lidar)
-    errors = kitti.segment_errors(T_world_estimate, T_world_true, _scan_period_s(sequence))
+    errors = kitti.segment_errors(T_world_estimate, T_world_true)
     average = kitti.average(errors)
     rpe = relative_pose_error(T_world_estimate, T_world_true)
     motion_error = relative_translation_error(T_world_lidar, T_true)
@@ -192,13 +190,6 @@ def _check(method: str, T_world_lidar: Tensor, sequence: Sequence) -> None:
         raise TrajectoryError(
             f"{where}: pose {first} is not finite.\n  change: this trajectory cannot be scored; run the method again"
         )
-
-
-def _scan_period_s(sequence: Sequence) -> float:
-    """Median time between scans."""
-    if sequence.timestamps is None or len(sequence.timestamps) < 2:
-        return _SCAN_PERIOD_S
-    return float(sequence.timestamps.diff().median())
 
 
 def _over_sequences(rows: Series[Score]) -> MeanOverSequences:

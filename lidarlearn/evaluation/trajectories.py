@@ -11,10 +11,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarlearn.data.pose_files import read_kitti_poses, read_tum_poses
+from lidarlearn.data.sequence import Sequence
 from lidarlearn.errors import UserError
+from lidarlearn.metrics.relative import relative_translation_error
 
 _KITTI_COLUMNS = 12
 _TUM_COLUMNS = 8
+_FAR_BETTER = 1 / 3  # of the errors, for poses to look like those of another frame
 _MAX_DEVIATION = 1e-2  # of R R^T from the identity; some tools write three digits
 
 
@@ -80,6 +83,35 @@ def read_trajectory(
         "  change: one pose a row, as 12 numbers (KITTI: 3x4 matrix) or 8 (TUM: time x y z qx qy qz qw), "
         "separated by spaces"
     )
+
+
+def lidar_poses(
+    T_world: Float[Tensor, "n 4 4"], stated: str | None, sequence: Sequence, path: Path
+) -> Float[Tensor, "n 4 4"]:
+    """Poses of the LiDAR from those of a file.
+
+    Args:
+        T_world: the file's poses.
+        stated: the frame that they are said to be in; None takes the frame in which the data set gives its own poses,
+            which is also that of our exports, unless they fit the ground truth far better as poses of the LiDAR.
+        sequence: what they are of.
+        path: the file.
+
+    Raises:
+        TrajectoryError: nothing is stated, and they look like poses of the LiDAR.
+    """
+    reference = sequence.reference_frame
+    T_world_lidar = to_lidar_frame(T_world, stated or reference, reference, sequence.T_reference_lidar)
+    T_true = sequence.T_world_lidar
+    if stated is None and T_true is not None and len(T_true) == len(T_world) and bool(T_world.isfinite().all()):
+        as_stated, as_lidar = (relative_translation_error(T, T_true) for T in (T_world_lidar, T_world))
+        if as_stated is not None and as_lidar is not None and as_lidar < _FAR_BETTER * as_stated:
+            raise TrajectoryError(
+                f"{path.absolute()}: the motions are {100 * as_stated:.0f} % off as poses of the {reference}, in which "
+                f"this data set gives its own, {100 * as_lidar:.0f} % as poses of the LiDAR.\n"
+                f"  change: trajectories_frame=lidar, or trajectories_frame={reference} if they are what they should be"
+            )
+    return T_world_lidar
 
 
 def to_lidar_frame(

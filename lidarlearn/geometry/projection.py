@@ -44,7 +44,10 @@ class SphericalProjection:
         return self.height * self.width
 
     def pixel_index(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch n"]:
-        """Each point's pixel, row * width + column in 32 bits; -1 outside the field of view and at the origin."""
+        """Each point's pixel, row * width + column in 32 bits; -1 outside the field of view, at the origin, for NaN.
+
+        Infinite points are not looked for: odometries and readers leave them out before.
+        """
         # Coordinates apart, in place, in 32 bits: a map of a million points is projected at the speed of the memory.
         x, y, z = coordinates = points.detach().movedim(-1, 0).contiguous()
         ranges = squared_ranges(coordinates.movedim(0, -1)).sqrt_()

@@ -1,6 +1,6 @@
 """Distances from the sensor."""
 
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -12,3 +12,9 @@ def squared_ranges(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]
     """
     x, y, z = points.unbind(-1)
     return (x * x).addcmul_(y, y).addcmul_(z, z)
+
+
+def in_range(points: Float[Tensor, "n 3"], min_range_m: float, max_range_m: float) -> Int[Tensor, "m"]:
+    """Indices of the points that are so far from the origin [m], none of those that are not finite."""
+    ranges = squared_ranges(points).sqrt_()
+    return ((ranges >= min_range_m) & (ranges <= max_range_m)).nonzero()[:, 0]

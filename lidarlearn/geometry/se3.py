@@ -34,7 +34,7 @@ def inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
 
 
 def orthonormalize(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """The nearest transform with a proper rotation.
+    """The nearest transform whose rotation part is orthonormal: a proper rotation, if it nearly was one.
 
     Products of poses drift from SO(3) by rounding, and a constant-velocity prediction, in which each pose stands
     twice, doubles that drift with every frame: a trajectory must be brought back as it grows.

@@ -26,14 +26,12 @@ class SegmentErrors:
         length_m: its nominal length [m], one of `SEGMENT_LENGTHS_M`.
         translation: translation error over the nominal length, a ratio.
         rotation: rotation error over the nominal length [rad/m].
-        speed: nominal length over the time of the segment's frames, the end frame counted [m/s].
     """
 
     first_frame: Int[Tensor, "s"]
     length_m: Float[Tensor, "s"]
     translation: Float[Tensor, "s"]
     rotation: Float[Tensor, "s"]
-    speed: Float[Tensor, "s"]
 
 
 @dataclass(frozen=True)
@@ -51,9 +49,7 @@ def path_distances(T_world: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n"]:
     return torch.cat([steps.new_zeros(min(len(T_world), 1)), steps.cumsum(0)])
 
 
-def segment_errors(
-    T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Tensor, "m 4 4"], scan_period_s: float = 0.1
-) -> SegmentErrors:
+def segment_errors(T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Tensor, "m 4 4"]) -> SegmentErrors:
     """Relative errors over all segments: starts every ten frames, each of the eight lengths that the path still holds.
 
     A segment ends at the first frame strictly farther than its nominal length along the ground truth. The inverses are
@@ -62,7 +58,6 @@ def segment_errors(
     Args:
         T_estimate: absolute poses in the frame in which the data set defines its metric (KITTI: the left camera).
         T_ground_truth: the same number of poses, in the same frame.
-        scan_period_s: time between scans, for the segments' speed.
 
     Raises:
         ValueError: the numbers of poses differ, or poses are not finite.
@@ -76,7 +71,6 @@ def segment_errors(
         length_m=length_m,
         translation=T_error[:, :3, 3].norm(dim=-1) / length_m,
         rotation=cosine.clamp(-1, 1).acos() / length_m,
-        speed=length_m / (scan_period_s * (last - first + 1)),
     )
 
 
@@ -123,5 +117,4 @@ def _select(errors: SegmentErrors, chosen: Tensor) -> SegmentErrors:
         errors.length_m[chosen],
         errors.translation[chosen],
         errors.rotation[chosen],
-        errors.speed[chosen],
     )

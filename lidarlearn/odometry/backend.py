@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.geometry import se3
+from lidarlearn.geometry.voxels import voxel_cells
 from lidarlearn.odometry.local_map import LocalMap
 from lidarlearn.odometry.sampling import SampledScan, Sampling
 from lidarlearn.registration.association.aggregated_points import AggregatedPoints
@@ -125,5 +126,5 @@ def neighbourhood_normals(points: Float[Tensor, "n 3"], voxel_size_m: float) -> 
     """Normals of a scan's points from the points in the voxels around each, zero where they span no plane."""
     surface = AggregatedPoints(voxel_size_m, points.device)
     surface.insert(points, frames=1)
-    index = surface.lookup((points / voxel_size_m).floor().long())
+    index = surface.lookup(voxel_cells(points, voxel_size_m))
     return torch.where((index >= 0)[:, None], surface.normals[index.clamp(min=0)], 0.0)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.geometry.ranges import squared_ranges
+from lidarlearn.geometry.ranges import in_range
 from lidarlearn.odometry.backend import Backend
 from lidarlearn.odometry.health import Health, Status
 from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
@@ -81,9 +81,7 @@ class Odometry(ScanByScan):
         return Frame(self._T_world_lidar, health)
 
     def _in_range(self, points: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        ranges = squared_ranges(points).sqrt_()
-        valid = (ranges >= self._min_range_m) & (ranges <= self._max_range_m)  # false where not finite
-        kept = valid.nonzero()[:, 0]
+        kept = in_range(points, self._min_range_m, self._max_range_m)
         points = points.index_select(0, kept).to(self._device)
         return points, None if times is None else times.index_select(0, kept).to(self._device)
 

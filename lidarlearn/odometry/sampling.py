@@ -127,7 +127,6 @@ class ImageSampling(Sampling):
         """The nearest points, and an evenly strided subset of them, scattered over rows and columns."""
         index = self.projection.nearest_points(points).flatten()
         index = index[index >= 0]
-        # A stride prime to the image's width scatters the subset instead of picking whole columns.
         count = min(self.max_queries, len(index))
         chosen = torch.linspace(0, max(len(index) - 1, 0), count, dtype=torch.float64, device=points.device)
         is_query = torch.zeros(len(index), dtype=torch.bool, device=points.device)

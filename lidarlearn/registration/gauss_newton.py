@@ -20,11 +20,11 @@ _FEW = 0.1  # share of the points below which neighbours are too few for what th
 class RegistrationResult:
     """Where a scan fits, and how well: enough to judge an alignment instead of trusting it.
 
-    All fields share the batch shape of the initial poses, and are on the CPU as poses are.
+    Tensors share the batch shape of the initial poses, and are on the CPU as poses are.
 
     Args:
         T_world_lidar: the registered poses, float64.
-        iterations: Gauss-Newton steps taken.
+        iterations: Gauss-Newton steps taken, those of the slowest of a batch.
         converged: whether the last step was below the tolerances, at the final search distance.
         overlap: share of the points that have a map neighbour with a normal within the search distance.
         inlier_share: share of those whose distance d from the map's surface is below `inlier_residual_m`.
@@ -86,6 +86,18 @@ class GaussNewton:
     max_step_m: float = 1.0
     max_step_deg: float = 10.0
 
+    def __post_init__(self) -> None:
+        if not (0 < self.narrowing < 1 and self.search_distance_m > 0):
+            raise ValueError(
+                "registration: narrowing must be between 0 and 1 and search_distance_m above 0, got "
+                f"narrowing={self.narrowing}, search_distance_m={self.search_distance_m}"
+            )
+        if self.max_iterations < 1 or self.coarse_stride < 1:
+            raise ValueError(
+                "registration: max_iterations and coarse_stride must be at least 1, got "
+                f"max_iterations={self.max_iterations}, coarse_stride={self.coarse_stride}"
+            )
+
     @property
     def _tolerances(self) -> Float[Tensor, "2"]:
         tolerances = [self.translation_tolerance_m, math.radians(self.rotation_tolerance_deg)]
@@ -118,7 +130,7 @@ class GaussNewton:
         T = T_world_lidar.cpu()
         converged = torch.zeros(T.shape[:-2], dtype=torch.bool)
         distance, iterations, found = search_distance_m, 0, None
-        while iterations < self.max_iterations and not converged.all():
+        while not iterations or (iterations < self.max_iterations and not converged.all()):
             iterations += 1
             final = distance <= self.search_distance_m
             stride = 1 if final else self.coarse_stride
@@ -211,6 +223,7 @@ class GaussNewton:
 
     def _judge(self, T: Tensor, iterations: int, converged: Tensor, equations: NormalEquations) -> RegistrationResult:
         position = position_of(equations)
+        order = position.information.argsort(dim=-1)
         neighbour = equations.mask.double()
         sums = [
             neighbour,
@@ -229,8 +242,8 @@ class GaussNewton:
             fit=fit / points,
             rmse_m=(equations.squares / weight.clamp(min=1e-12)).sqrt(),
             hessian=equations.H,
-            information=position.information,
-            weakest_direction=position.directions[..., 0],
+            information=position.information.gather(-1, order),
+            weakest_direction=position.directions.take_along_dim(order[..., None, :], dim=-1)[..., 0],
         )
 
     def _fits(self, equations: NormalEquations) -> Float[Tensor, "*batch m"]:

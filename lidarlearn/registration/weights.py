@@ -1,7 +1,7 @@
 """Robust weights of iteratively reweighted least squares.
 
-Each is a small frozen class with one method, `weight`, of the signed residuals and of the squared distances between
-the associated points. Weights are in [0, 1]; the scale parameters are in metres.
+Each is a small frozen class with one method, `weight`, of the sizes of the residuals and of the squared distances
+between the associated points. Weights are in [0, 1]; the scale parameters are in metres.
 """
 
 from abc import ABC, abstractmethod

@@ -8,8 +8,8 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.evaluate import configured_method
 from lidarlearn.evaluation.layout import TableLayout
-from lidarlearn.evaluation.methods import parse_method
 
 FOLDER = config_directory() / "experiment"
 
@@ -30,7 +30,7 @@ def composed(program, experiment):
 def test_a_table_has_its_methods_networks_and_columns(name):
     config = composed("evaluate", name)
     layout: TableLayout = instantiate(config.table, _convert_="all")
-    methods = [str(parse_method(method, config.networks)) for method in config.methods]
+    methods = [str(configured_method(config, method)) for method in config.methods]
     in_table = {sequence for column in layout.columns.values() for sequence in column}
     assert set(config.data.test_sequences) <= in_table
     assert set(methods) - set(layout.published) <= {"posenet_supervised"}  # beside the paper's rows

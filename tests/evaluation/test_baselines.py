@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from lidarlearn.errors import UserError
-from lidarlearn.evaluation.methods import BASELINES
 from lidarlearn.geometry import se3
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
@@ -14,6 +13,7 @@ from lidarlearn.simulation.sensors import hdl64
 from tests.odometry.odometries import build, motion_errors, poses
 
 PACKAGES = {"kiss_icp": "kiss-icp", "small_gicp": "small_gicp"}
+BASELINES = tuple(PACKAGES)
 
 
 @pytest.fixture(scope="module")

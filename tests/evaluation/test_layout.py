@@ -24,6 +24,13 @@ def cells(table):
     return {row[0]: row[1:] for row in (*table.rows, *table.reference)}
 
 
+def test_a_cell_says_how_many_sequences_its_mean_is_over():
+    short = [Score("m", name, 51, 60.0, 0) for name in ("b", "c")]
+    table = TableLayout("t", {"all": ["a", "b", "c"]}).table([row("m", "a", 1.0), *short], {})
+    assert cells(table) == {"m": ("1.000 (1 of 3)",)}
+    assert any(note.startswith("(n of m)") for note in table.notes)
+
+
 def test_a_cell_is_the_mean_over_its_column_and_says_what_was_seen_in_training_or_is_missing():
     layout = TableLayout("t", COLUMNS, published={"cv+p_f2m": [0.7, None]}, source="Somebody 2020")
     table = layout.table(SCORES, {"posenet_icp": ["a", "b", "x"]})

@@ -1,42 +1,53 @@
 import pytest
 
+from lidarlearn.commands.evaluate import configured_method
 from lidarlearn.errors import UserError
-from lidarlearn.evaluation.methods import BACKENDS, INITIALIZATIONS, Method, parse_method
+from lidarlearn.evaluation.methods import Method, parse_method
+from tests.odometry.odometries import composed
+
+INITIALIZATIONS = ("ni", "cv", "ei", "posenet")
+BACKENDS = tuple(f"{a}_{m}" for a in ("p", "kd", "vh") for m in ("f2f", "f2m"))
+BASELINES = ("kiss_icp", "small_gicp")
+
+
+def parsed(name: str, *networks: str) -> Method:
+    return parse_method(name, [*INITIALIZATIONS, *networks], BACKENDS, BASELINES)
 
 
 @pytest.mark.parametrize("initialization", INITIALIZATIONS)
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_names_say_the_parts_and_the_parts_the_name(initialization, backend):
-    method = parse_method(f"{initialization}+{backend}")
+def test_every_combination_of_the_paper_is_configured_and_its_name_says_the_parts(initialization, backend):
+    method = configured_method(composed(), f"{initialization}+{backend}")
     assert method == Method(initialization, backend)
     assert str(method) == f"{initialization}+{backend}"
 
 
-@pytest.mark.parametrize("initialization", INITIALIZATIONS)
-def test_an_initialization_can_stand_alone(initialization):
-    method = parse_method(initialization)
-    assert method == Method(initialization, None) and str(method) == initialization
+@pytest.mark.parametrize("name", [*INITIALIZATIONS, *BASELINES])
+def test_an_initialization_or_a_baseline_can_stand_alone(name):
+    method = configured_method(composed(), name)
+    assert method == Method(name, None) and str(method) == name
 
 
 def test_the_papers_capitals_are_understood():
-    assert parse_method("CV+Kd_F2M") == Method("cv", "kd_f2m")
-
-
-def test_every_combination_of_the_paper_exists():
-    assert set(INITIALIZATIONS) == {"ni", "cv", "ei", "posenet"}
-    assert set(BACKENDS) == {f"{a}_{m}" for a in ("p", "kd", "vh") for m in ("f2f", "f2m")}
+    assert parsed("CV+Kd_F2M") == Method("cv", "kd_f2m")
 
 
 @pytest.mark.parametrize(
-    "name", ["", "icp", "cv+", "cv+icp_f2m", "kd_f2m", "cv+kd", "+kd_f2m", "cv kd_f2m", "cv+kd_f2m+"]
+    "name", ["", "icp", "cv+", "cv+icp_f2m", "kd_f2m", "cv+kd", "+kd_f2m", "cv kd_f2m", "cv+kd_f2m+", "kiss_icp+kd_f2m"]
 )
 def test_other_names_are_refused_with_the_ones_there_are(name):
     with pytest.raises(UserError, match=r"no method '.*'\.\n  change: .*cv\+kd_f2m") as error:
-        parse_method(name)
-    assert all(part in str(error.value) for part in (*INITIALIZATIONS, *BACKENDS))
+        parsed(name)
+    assert all(part in str(error.value) for part in (*INITIALIZATIONS, *BACKENDS, *BASELINES))
 
 
-def test_networks_are_initializations_by_their_own_names():
-    assert parse_method("posenet_icp+kd_f2m", ["posenet_icp"]) == Method("posenet_icp", "kd_f2m")
-    with pytest.raises(UserError, match="posenet_icp"):
-        parse_method("posenet_cpi", ["posenet_icp"])
+@pytest.mark.parametrize("name", ["PoseNet_ICP+kd_f2m", "posenet_icp+kd_f2m"])
+def test_networks_are_initializations_by_their_own_names_in_any_case(name):
+    assert parsed(name, "PoseNet_ICP") == Method("PoseNet_ICP", "kd_f2m")
+    with pytest.raises(UserError, match="PoseNet_ICP"):
+        parsed("posenet_cpi", "PoseNet_ICP")
+
+
+def test_a_backend_of_ones_own_needs_nothing_but_its_config():
+    config = composed("+odometry@odometry.mine=kd_f2m")
+    assert configured_method(config, "cv+mine") == Method("cv", "mine")

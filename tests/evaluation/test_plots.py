@@ -105,6 +105,11 @@ def test_what_cannot_be_drawn_is_left_out(unknown_drive):
     assert list(drawn) == ["trajectories_unknown"]
 
 
+def test_an_error_on_the_way_leaves_the_figures_of_what_was_finished(unknown_drive):
+    drawn = dict(figures({"first": unknown_drive, "second": unknown_drive}, {"m": {"first": se3.identity(5)}}, []))
+    assert list(drawn) == ["trajectories_first"]
+
+
 def test_groups_of_sequences_get_distributions_of_their_own(make_sequence, longer):
     sequences = {"slow": make_sequence("slow", 50), "fast": make_sequence("fast", 50)}
     sequences["fast"].T_world_lidar = longer(sequences["fast"].T_world_lidar, 2.0)

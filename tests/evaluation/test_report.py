@@ -91,10 +91,23 @@ def test_drift_table(scores):
     assert "published" not in notes
 
 
-def test_no_ground_truth_leaves_a_dash_and_says_so():
-    table = drift_table("folder", [Score("m", "unknown", 5)])
-    assert cells(table, "m")["unknown"] == "-"
+def test_a_sequence_without_ground_truth_leaves_a_dash_and_says_so(scores):
+    table = drift_table("folder", [*scores, Score("posenet", "unknown", 5)])
+    assert cells(table, "posenet")["unknown"] == "-"
     assert any("no ground truth" in note for note in table.notes)
+
+
+def test_without_any_ground_truth_one_table_says_what_is_known():
+    (table,) = report_tables("folder", [Score("m", "a", 5, frames_per_second=9.0, health={"flagged": 1})])
+    assert table.columns == ("method", "sequence", "scans", "flagged", "scans/s")
+    assert table.rows == (("m", "a", "5", "1", "9.0"),)
+    assert "no ground truth" in table.title
+
+
+def test_one_sequence_has_no_means(scores):
+    table = drift_table("simulated_urban", [row for row in scores if row.sequence == "a"])
+    assert table.columns == ("method", "a") and {len(row) for row in table.rows} == {2}
+    assert not any("averages" in note for note in table.notes)
 
 
 def test_averages_over_fewer_sequences_say_so():
@@ -134,7 +147,7 @@ def test_details_table_has_units_and_a_row_for_each_result(scores):
     assert first["motion [%]"] == "10.00"
     assert first["fails"] == "0"
     assert first["scans/s"] == "12.3"
-    assert table.rows[-1][2:] == ("-",) * 9
+    assert table.rows[-1][2:] == ("5", *("-",) * 9)
 
 
 def test_results_md_and_the_terminal_show_the_same_tables(tmp_path, scores):

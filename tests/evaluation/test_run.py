@@ -93,6 +93,27 @@ def test_what_came_before_a_damaged_scan_is_exported_as_partial(sequence, tmp_pa
     assert json.loads((tmp_path / "04.partial.json").read_text())["frames_per_second"] > 0
 
 
+def test_nothing_of_an_earlier_run_stays(sequence, tmp_path):
+    export = Export(tmp_path, "04")
+    run_odometry(OneMetreAScan(), sequence, export)
+    sequence.damaged = 3
+    with pytest.raises(UserError):
+        run_odometry(OneMetreAScan(), sequence, export)
+    assert {path.name.split(".")[1] for path in tmp_path.iterdir()} == {"partial"}
+    sequence.damaged = None
+    run_odometry(OneMetreAScan(), sequence, export)
+    assert not list(tmp_path.glob("*.partial.*"))
+
+
+def test_an_interrupted_run_leaves_what_it_has(sequence, tmp_path):
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_odometry(OneMetreAScan(), sequence, Export(tmp_path, "04"), advance=interrupt)
+    assert len((tmp_path / "04.partial.txt").read_text().splitlines()) == 1
+
+
 def test_a_damaged_first_scan_leaves_nothing(sequence, tmp_path):
     sequence.damaged = 0
     with pytest.raises(UserError):

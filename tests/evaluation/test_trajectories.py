@@ -7,6 +7,7 @@ from lidarlearn.errors import UserError
 from lidarlearn.evaluation.trajectories import (
     TrajectoryError,
     find_trajectories,
+    lidar_poses,
     read_trajectory,
     to_lidar_frame,
     to_reference_frame,
@@ -131,6 +132,19 @@ def test_camera_and_lidar_frames(poses, T_camera_lidar):
 def test_a_frame_that_the_data_set_does_not_know_is_refused(poses, frame):
     with pytest.raises(TrajectoryError, match=f"frame '{frame}'.* lidar"):
         to_lidar_frame(poses, frame, "lidar", se3.identity())
+
+
+def test_poses_are_taken_to_be_in_the_frame_of_the_data_set_unless_they_fit_far_better_as_the_lidars(
+    make_sequence, T_camera_lidar, tmp_path
+):
+    sequence = make_sequence("04", 20, T_camera_lidar)
+    as_lidar, as_camera = sequence.T_world_lidar, to_reference_frame(sequence.T_world_lidar, T_camera_lidar)
+    torch.testing.assert_close(lidar_poses(as_camera, None, sequence, tmp_path / "04.txt"), as_lidar)
+    assert lidar_poses(as_lidar, "lidar", sequence, tmp_path / "04.txt") is as_lidar
+    with pytest.raises(TrajectoryError, match="trajectories_frame=lidar"):
+        lidar_poses(as_lidar, None, sequence, tmp_path / "04.txt")
+    lidar_poses(as_lidar, "camera", sequence, tmp_path / "04.txt")  # whoever says so is believed
+    lidar_poses(as_lidar[:5], None, sequence, tmp_path / "04.txt")  # another number is another error's matter
 
 
 def touch(folder, *names):

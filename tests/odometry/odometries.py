@@ -10,8 +10,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from lidarlearn.commands.configs import config_directory
-from lidarlearn.commands.evaluate import build_odometry
-from lidarlearn.evaluation.methods import parse_method
+from lidarlearn.commands.evaluate import build_odometry, configured_method
 from lidarlearn.geometry import se3
 from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
 from lidarlearn.simulation import scenes
@@ -29,7 +28,8 @@ SENSORS = {"hdl64": hdl64(columns=1024), "hdl32": hdl32(), "vlp16": vlp16(), "os
 
 def build(name: str, *overrides: str, projection: str = "hdl64") -> ScanByScan:
     """A fresh odometry, e.g. "cv+kd_f2m", as `evaluate.py` builds it."""
-    return build_odometry(composed(f"projection@data.projection={projection}", *overrides), parse_method(name))
+    config = composed(f"projection@data.projection={projection}", *overrides)
+    return build_odometry(config, configured_method(config, name))
 
 
 @cache

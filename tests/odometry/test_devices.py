@@ -5,10 +5,12 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 import torch
+from hydra.utils import instantiate
 from torch import Tensor
 
+from lidarlearn.evaluation.convergence import Basin, Probe, convergence_basin
 from tests import pretend_device
-from tests.odometry.odometries import build, kd_at_least, poses, run, scans
+from tests.odometry.odometries import build, composed, kd_at_least, poses, run, scans, street
 
 SCANS = 5
 LAUNCHES, TRANSFERS = 1500, 100  # at most, for a scan
@@ -24,6 +26,30 @@ def run_elsewhere(association: str) -> tuple[Tensor, int, int]:
         device.launches = device.transfers = 0
         frames += run(odometry, [last])
     return poses(frames), device.launches, device.transfers
+
+
+def basin(association: str, device: str) -> Basin:
+    """Of a backend on a device, from a few initial poses of one scan."""
+    probe = Probe(offsets_m=[0.5], angles_deg=[4.0], directions=2, every=2)
+    backend = instantiate(
+        composed("projection@data.projection=hdl64", f"device={device}").odometry[f"{association}_f2m"]
+    )
+    return convergence_basin(backend, street(frames=3), probe, device)
+
+
+def basin_elsewhere(association: str) -> Basin:
+    torch.set_num_threads(1)
+    with pretend_device.pretended():
+        return basin(association, f"{pretend_device.NAME}:0")
+
+
+@pytest.mark.skipif(not pretend_device.IS_SUPPORTED, reason="needs a more recent torch")
+@kd_at_least
+def test_basins_are_measured_on_another_device(association):
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        elsewhere = process.submit(basin_elsewhere, association).result()
+    assert elsewhere == basin(association, "cpu")
+    assert elsewhere.scans == 1 and elsewhere.by_offset_m[0.5] > 0
 
 
 @pytest.mark.skipif(not pretend_device.IS_SUPPORTED, reason="needs a more recent torch")

@@ -116,7 +116,7 @@ def test_an_empty_map_leaves_the_initial_pose(association):
 
 
 @all_associations
-@pytest.mark.parametrize("batch", [(), (3,)])
+@pytest.mark.parametrize("batch", [(), (3,), (0,)])
 def test_no_points_leave_the_initial_pose(association, batch):
     scene = maps.scene("room", association)
     T_start = se3.identity(*batch)
@@ -198,6 +198,14 @@ def test_the_optimum_of_a_plane_is_found_in_closed_form():
     assert end[2:5].abs().max() < 1e-4
     assert (end[:2] - start[:2]).abs().max() < 0.05 and (end[5] - start[5]).abs() < 0.01
     assert result.information[:2].max() < 1e-6 < 0.9 < result.information[2]
+
+
+@pytest.mark.parametrize(
+    "setting", [{"narrowing": 1.0}, {"search_distance_m": 0.0}, {"max_iterations": 0}, {"coarse_stride": 0}]
+)
+def test_settings_that_never_come_to_an_end_are_refused(setting):
+    with pytest.raises(ValueError, match=f"{next(iter(setting))}={next(iter(setting.values()))}"):
+        GaussNewton(**setting)
 
 
 def test_steps_are_limited():

@@ -41,7 +41,7 @@ class KdTree(AggregatedMap):
             points = self.points.cpu().contiguous().numpy()
             self._tree = cKDTree(points, leafsize=_LEAF_SIZE, balanced_tree=False, compact_nodes=False)
         queries = points_world.cpu().numpy()
-        workers = 1 if len(queries) < _FEW else -1
+        workers = 1 if len(queries) < _FEW else torch.get_num_threads()
         reach_m = max_distance_m + _MARGIN_M
         found = self._tree.query(queries, k=2, distance_upper_bound=reach_m, workers=workers)
         distances, index = np.asarray(found[0]), np.asarray(found[1])
