@@ -51,7 +51,7 @@ def main(description: str | None, **benchmarks: Benchmark) -> None:
 
     A benchmark that fails does not take from the others what they measured; the exit code tells of it.
     """
-    parser = argparse.ArgumentParser(description=(description or "").partition("\n")[0])
+    parser = argparse.ArgumentParser(_program(), description=(description or "").partition("\n")[0].partition(": `")[0])
     parser.add_argument("--quick", action="store_true", help="a few scans, once: for correctness, not for time")
     parser.add_argument("--kitti", type=Path, help="folder of KITTI odometry with sequence 04")
     parser.add_argument("--json", type=Path, help="file to write the tables to")
@@ -72,6 +72,12 @@ def main(description: str | None, **benchmarks: Benchmark) -> None:
             arguments.json.write_text(json.dumps({"about": about(options), **tables}, indent=2))
     if failures:
         sys.exit("error: " + "\n  ".join(failures))
+
+
+def _program() -> str:
+    """As it was called: argparse alone would say "__main__.py"."""
+    spec = sys.modules["__main__"].__spec__
+    return Path(sys.argv[0]).name if spec is None else f"python -m {spec.name.removesuffix('.__main__')}"
 
 
 class BenchmarkError(Exception):

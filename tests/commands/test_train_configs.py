@@ -69,6 +69,11 @@ def test_kitti_is_trained_as_in_the_paper():
     assert (config.datamodule.height, config.data.projection.height, config.data.projection.width) == (None, 64, 720)
 
 
+def test_the_papers_network_goes_without_what_we_added():
+    config = composed("experiment=network/paper_kitti_00-08")
+    assert (config.model.encoding, config.model.wrap_columns, config.datamodule.augmentation) == ("maps", False, None)
+
+
 def test_simulated_data_brings_its_quick_recipe_which_the_command_line_overrides():
     quick, own = composed(), composed("trainer.max_epochs=3", "optimizer.lr=0.5", "datamodule.height=8")
     assert quick.trainer.max_epochs < 100 and quick.datamodule.height == 32 and quick.scheduler == "cosine"
