@@ -75,6 +75,8 @@ def read_run(folder: Path) -> Run:
         UserError: it holds no results of an evaluation.
     """
     path = folder / "results.json"
+    if not path.is_file():
+        raise UserError(f"{path.absolute()}: no such file\n  change: name run folders of evaluate.py")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         scores = [_score(row) for row in content["results"]]
@@ -179,14 +181,19 @@ def _labelled(runs: Series[Run]) -> list[Score]:
 def _variation(settings: Settings, variants: Series[Settings]) -> str:
     """Those settings that differ between the variants, in brackets, by the last words of their names where these do.
 
-    The sensor's projection belongs to the data.
+    A part is called by its class, as in "weight=Huber". The sensor's projection belongs to the data.
     """
     known = dict.fromkeys(key for variant in variants for key in variant if "projection" not in key.split("."))
     keys = [key for key in known if len({repr(variant.get(key)) for variant in variants}) > 1]
-    last = [key.rpartition(".")[2] for key in keys]
-    names = [short if last.count(short) == 1 else key for key, short in zip(keys, last, strict=True)]
-    values = [f"{name}={settings.get(key)}" for name, key in zip(names, keys, strict=True)]
+    names = {key: key.removesuffix("._target_") for key in keys}
+    last = [name.rpartition(".")[2] for name in names.values()]
+    shown = {key: short if last.count(short) == 1 else names[key] for key, short in zip(keys, last, strict=True)}
+    values = [f"{shown[key]}={_value(key, settings[key])}" for key in keys if key in settings]
     return f" [{', '.join(values)}]" if values else ""
+
+
+def _value(key: str, value: object) -> str:
+    return str(value).rpartition(".")[2] if key.endswith("._target_") else str(value)
 
 
 def _flat(settings: Any, prefix: str = "") -> Settings:

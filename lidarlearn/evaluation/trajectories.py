@@ -152,8 +152,9 @@ def find_trajectories(path: Path, sequences: Series[str]) -> dict[str, dict[str,
     """Trajectory files of any tool, by method and sequence.
 
     Args:
-        path: a file (for one sequence), a folder of `<sequence>.txt` or `.tum`, or a folder of such folders, one for
-            each method. A method is called as its folder; a single file's as the file unless that is the sequence.
+        path: a file (for one sequence), a folder of `<sequence>.txt` or `.tum`, a folder of such folders, one for each
+            method, or an evaluation's run folder, which holds the last. A method is called as its folder; a single
+            file's as the file unless that is the sequence.
         sequences: names of all sequences to be scored.
 
     Raises:
@@ -171,6 +172,7 @@ def find_trajectories(path: Path, sequences: Series[str]) -> dict[str, dict[str,
         raise TrajectoryError(
             f"{path.absolute()}: no such file or folder of trajectories.\n  change: trajectories=PATH"
         )
+    path = path / "trajectories" if (path / "trajectories").is_dir() else path
     found = {folder.absolute().name: _in_folder(folder, sequences) for folder in _candidates(path)}
     found = {method: files for method, files in found.items() if files}
     if not found:

@@ -11,7 +11,7 @@ from lidarlearn.geometry import se3
 from lidarlearn.registration.association.base import Association, Neighbours
 from lidarlearn.registration.normal_equations import NormalEquations, position_of
 from lidarlearn.registration.residuals import PointToPlane, Residual
-from lidarlearn.registration.weights import Proximity, RobustWeight
+from lidarlearn.registration.weights import GemanMcClure, RobustWeight
 
 _FEW = 0.1  # share of the points below which neighbours are too few for what they say to be believed
 
@@ -73,7 +73,7 @@ class GaussNewton:
     """
 
     residual: Residual = field(default_factory=PointToPlane)
-    weight: RobustWeight = field(default_factory=Proximity)
+    weight: RobustWeight = field(default_factory=GemanMcClure)
     max_iterations: int = 50
     search_distance_m: float = 0.5
     narrowing: float = 0.85

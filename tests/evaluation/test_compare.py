@@ -69,6 +69,13 @@ def test_settings_of_one_name_are_told_apart_by_the_whole_of_it(make_run):
     assert [row.method for row in group.scores] == ["m [a.size=1, b.size=5]", "m [a.size=2, b.size=6]"]
 
 
+def test_another_part_is_called_by_its_class_with_its_own_settings(make_run):
+    huber = {"weight": {"_target_": "lidarlearn.registration.weights.Huber", "delta_m": 0.2}}
+    cauchy = {"weight": {"_target_": "lidarlearn.registration.weights.Cauchy", "sigma_m": 0.1}}
+    (group,) = groups(make_run("1", "m", "a", settings=huber), make_run("2", "m", "a", settings=cauchy))
+    assert [row.method for row in group.scores] == ["m [weight=Huber, delta_m=0.2]", "m [weight=Cauchy, sigma_m=0.1]"]
+
+
 def test_the_sensor_of_the_data_is_no_setting_of_the_method(make_run):
     runs = [
         make_run(s, "m", s, settings={"sampling": {"projection": {"height": h}}}) for s, h in (("a", 64), ("b", 32))
@@ -113,8 +120,8 @@ def test_an_experiments_table_spans_data_sets(make_run, tmp_path):
 
 
 def test_a_folder_without_results_is_named(tmp_path):
-    with pytest.raises(UserError, match=r"results\.json: not the result of an evaluation"):
+    with pytest.raises(UserError, match=r"results\.json: no such file"):
         read_run(tmp_path)
     (tmp_path / "results.json").write_text("{}")
-    with pytest.raises(UserError, match="results"):
+    with pytest.raises(UserError, match=r"results\.json: not the result of an evaluation"):
         read_run(tmp_path)

@@ -167,6 +167,12 @@ def test_finds_folders_of_several_methods(tmp_path):
     assert {method: files["09"].name for method, files in found.items()} == {"cv+p_f2m": "09.tum", "posenet": "09.txt"}
 
 
+def test_finds_the_trajectories_of_a_run_folder(tmp_path):
+    touch(tmp_path / "trajectories" / "cv+kd_f2m", "00.txt", "00.tum", "00.health.csv")
+    touch(tmp_path / "plots", "trajectories_00.png")
+    assert find_trajectories(tmp_path, ["00"]) == {"cv+kd_f2m": {"00": tmp_path / "trajectories/cv+kd_f2m/00.txt"}}
+
+
 def test_a_single_file_names_its_method(tmp_path):
     touch(tmp_path / "loam", "09.txt", "loam_on_09.txt")
     assert list(find_trajectories(tmp_path / "loam" / "09.txt", ["09"])) == ["loam"]

@@ -8,6 +8,9 @@ import torch
 from torch import Tensor
 
 from lidarlearn.geometry import se3
+from lidarlearn.odometry import Backend, GridSampling, LocalMap, Odometry
+from lidarlearn.odometry.initialization import ConstantVelocity
+from lidarlearn.registration.association import KdTree
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl64
@@ -169,6 +172,11 @@ def test_without_recovery_a_surprise_is_still_flagged():
 def test_what_is_no_scan_is_refused(method, points, times, said):
     with pytest.raises(ValueError, match=said):
         build(method).register_scan(points, times)
+
+
+def test_the_readmes_odometry_is_cv_kd_f2m():
+    by_hand = Odometry(ConstantVelocity(), Backend(GridSampling(), LocalMap(KdTree())))
+    assert torch.equal(poses(run(by_hand, scans()[:6])), poses(run(build("cv+kd_f2m"), scans()[:6])))
 
 
 def test_scans_may_be_arrays_of_any_number_type():
