@@ -45,8 +45,7 @@ class Table:
         """Print it to a terminal."""
         widths = self._widths(console.width)
         roomy = sum(widths) + 2 * len(widths) < console.width
-        title = Text(self.title, "bold")
-        table = RichTable(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, int(roomy), 0, 0))
+        table = RichTable(box=SIMPLE_HEAD, padding=(0, int(roomy), 0, 0))
         best = self._lowest()
         for i, (column, width) in enumerate(zip(self._headings(), widths, strict=True)):
             justify: Literal["left", "right"] = "left" if i < self.labels else "right"
@@ -57,6 +56,7 @@ class Table:
             table.add_section()
         for row in self.reference:
             table.add_row(*map(Text, row), style="dim")
+        console.print(Text(self.title, "bold"))  # not the table's own title, which folds with a narrow table
         console.print(table)
         for note in self.notes:
             console.print(Text(note, "dim"))
