@@ -11,7 +11,6 @@ PARAM.mat and paper place the laser at (2.4, -0.01, -2.3) m, (180, 0, 90) deg in
 which for turned points reads [2.4, -0.01, -2.3, 180, 0, 0].
 """
 
-import hashlib
 import logging
 import zipfile
 import zlib
@@ -192,7 +191,7 @@ def read_poses(name: str, scans: ScanFiles) -> NDArray[np.float64]:
         DamagedFileError: a scan cannot be read or its pose is not finite.
     """
     kept = scans.folder.parent / _POSES_FILE
-    key = hashlib.sha256(repr((scans.names, scans.sizes)).encode()).hexdigest()
+    key = scans.fingerprint("poses")
     if (stamped := _kept_poses(kept, key)) is not None:
         return stamped
     with ThreadPoolExecutor() as pool:  # inflating the files runs beside python

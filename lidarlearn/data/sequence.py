@@ -67,7 +67,10 @@ class Sequence(ABC):
     @property
     @abstractmethod
     def fingerprint(self) -> str:
-        """Changes whenever a scan would come out differently: settings of the reader, files and their sizes."""
+        """Changes whenever a scan would come out differently: settings of the reader, and the files.
+
+        What the code makes of them is not its concern, see `source_digest`.
+        """
 
     def __iter__(self) -> Iterator[Scan]:
         return (self.scan(i) for i in range(len(self)))

@@ -18,7 +18,7 @@ from rich.progress import Progress
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.simulation.drive import Drive
+from lidarlearn.simulation.drive import Drive, simulator_digest
 from lidarlearn.simulation.sensors import Sensor
 from lidarlearn.simulation.trajectories import read_poses
 from lidarlearn.simulation.worlds import PRESETS
@@ -75,6 +75,10 @@ class SimulatedDataSet(DataSet):
 
     A sequence is called `<world>_<number>`, e.g. urban_00; worlds are urban, highway, campus and segway. Each number
     has a place and a way of its own: different numbers for training, validation and test are different places.
+
+    The range images lie in `root/simulator_<digest of its code>/<name>_<digest of the settings>`, 131 kB for each scan
+    of 64 beams. A changed simulator makes every drive anew; what earlier ones made lies in the folders beside its own
+    and may be deleted.
 
     Args:
         root: folder of the range images; any two settings can share it.
@@ -173,8 +177,8 @@ class SimulatedDataSet(DataSet):
                 _make(jobs, self.workers)
 
     def folder(self, drive: Drive) -> Path:
-        """Where the range images of a drive lie."""
-        return self.root / f"{drive.name}_{drive.fingerprint}"
+        """Where the range images of a drive lie: with all that the same code of the simulator made."""
+        return self.root / f"simulator_{simulator_digest()}" / f"{drive.name}_{drive.fingerprint}"
 
     def _names(self) -> list[str]:
         return list(dict.fromkeys((*self.train_sequences, *self.val_sequences, *self.test_sequences)))
