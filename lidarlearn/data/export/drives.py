@@ -1,6 +1,7 @@
 """What all formats ask of a drive."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -13,6 +14,21 @@ from lidarlearn.errors import UserError
 
 PERIOD_S = 0.1
 _SWEEP_TOLERANCE = 0.01  # of a revolution
+
+
+def write_shared(path: Path, text: str) -> None:
+    """Write a file that all sequences of a copy share.
+
+    Raises:
+        UserError: it is there already, and says something else.
+    """
+    if path.is_file() and path.read_bytes() != text.encode():
+        raise UserError(
+            f"{path.absolute()} belongs to other sequences, and is not written over.\n"
+            "  change: to.root=/an/empty/folder"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
 
 
 def scans_of(drive: Sequence, name: str) -> Iterator[Scan]:

@@ -29,7 +29,7 @@ def write_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd
         suffix: .bin, .npy, .pcd or .ply.
     """
     if suffix not in SUFFIXES:
-        raise UserError(f"scans cannot be written as {suffix}.\n  change: suffix={'|'.join(SUFFIXES)}")
+        raise UserError(f"scans cannot be written as {suffix!r}.\n  change: suffix={'|'.join(SUFFIXES)}")
     folder = target.root / name
     folder.mkdir(parents=True, exist_ok=True)
     for index, scan in enumerate(scans_of(drive, name)):
