@@ -55,18 +55,19 @@ def check(overrides: Sequence[str], console: Console) -> bool:
 def export_all(overrides: Sequence[str], console: Console) -> bool:
     """Write the sequences of one data set in the format of another, and say how to train on them."""
     # imported late: the writers' libraries are of no use to a check
-    from lidarlearn.data.export.formats import export, require_new, require_writable
+    from lidarlearn.data.export.formats import export, format_of, require_new
 
     suffix = next((o.removeprefix("suffix=") for o in overrides if o.startswith("suffix=")), None)
     of_target = [o.replace("to", "data", 1) for o in overrides if o.startswith(("to=", "to."))]
     source = compose_data_set([o for o in overrides if not o.startswith(("to=", "to.", "suffix="))])
     target = compose_data_set(of_target)
-    require_writable(target, suffix)
+    format_of(target, suffix)
     theirs = matched_names(source, target)
     for name in theirs.values():
         require_new(target, name)
     source.prepare(theirs)
-    for mine, drive in source.sequences(theirs).items():
+    drives = {name: source.sequence(name) for name in theirs}
+    for mine, drive in drives.items():
         export(drive, target, theirs[mine], suffix)
         console.print(f"{mine} -> {theirs[mine]}: {len(drive)} scans", markup=False)
     if left_out := [name for name in source.names if name not in theirs]:

@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from filelock import FileLock, Timeout
 from jaxtyping import Float, Int16
-from rich.progress import track
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from lidarlearn.data.progress import tracked
 from lidarlearn.data.sequence import Sequence
+from lidarlearn.data.writable import writable
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.source_digest import source_digest
@@ -29,6 +30,7 @@ QUANTUM_M = 0.004
 _MAPS, _DONE = "vertex_maps.npy", "done.npy"
 _CHUNK = 32  # frames between two notes of what is done: at most so many are projected again after a kill
 _SPARE_BYTES = 50_000_000
+_REMEDY = "datamodule.cache_root=/path/with/room, or the environment variable LIDARLEARN_CACHE"
 
 
 class VertexMaps:
@@ -89,12 +91,12 @@ def cached_vertex_maps(
 
     Raises:
         DamagedFileError: a scan cannot be read.
-        UserError: the disk is too small.
+        UserError: the disk is too small, or cannot be written to.
     """
     folder = cache_root / _fingerprint(sequence, projection)
     shape = (len(sequence), 3, projection.height, projection.width)
     if not _complete(folder, shape):
-        folder.mkdir(parents=True, exist_ok=True)
+        writable(folder, _REMEDY)
         with _locked(folder / ".lock", sequence.name):
             if not _complete(folder, shape):
                 _build(folder, shape, sequence, projection, num_workers)
@@ -158,7 +160,7 @@ def _build(
         generator=torch.Generator(),  # leaves the global one alone: a training is the same with or without a cache
     )
     finished: list[int] = []
-    for index, vertex_map in track(scans, f"projecting sequence {sequence.name}", total=len(missing)):
+    for index, vertex_map in tracked(scans, f"projecting sequence {sequence.name}", len(missing)):
         if isinstance(vertex_map, UserError):
             raise vertex_map
         maps[index] = vertex_map.numpy()
@@ -187,7 +189,7 @@ def _new(file: Path, shape: tuple[int, ...], dtype: type) -> np.memmap:
     if free < needed + _SPARE_BYTES:  # a full disk under a mapped file kills the process without a word
         raise UserError(
             f"{file.parent.absolute()}: {needed / 1e9:.2f} GB of vertex maps do not fit, {free / 1e9:.2f} GB are free."
-            "\n  change: datamodule.cache_root=/path/with/room, or train on fewer scans (data.max_frames)"
+            f"\n  change: {_REMEDY}, or train on fewer scans (data.max_frames)"
         )
     return np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=shape)
 

@@ -24,7 +24,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from rich.progress import track
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 from scipy.spatial.transform import Rotation
@@ -35,6 +34,7 @@ from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import as_transforms, start_at_identity
+from lidarlearn.data.progress import tracked
 from lidarlearn.data.scan_files import ScanFiles, list_scans, subfolders, warn_of_gaps
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
@@ -199,7 +199,7 @@ def read_poses(name: str, scans: ScanFiles) -> NDArray[np.float64]:
         return stamped
     with ThreadPoolExecutor() as pool:  # inflating the files runs beside python
         rows = pool.map(_read_pose, (scans.path(i) for i in range(len(scans))))
-        stamped = np.stack(list(track(rows, f"poses of {name}", total=len(scans), transient=True)))
+        stamped = np.stack(list(tracked(rows, f"reading the poses of {name}", len(scans))))
     try:
         np.savez(kept, key=key, stamped=stamped)
     except OSError as error:

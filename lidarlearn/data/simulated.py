@@ -7,16 +7,16 @@ import re
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from filelock import FileLock
-from rich.progress import Progress
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError, one_line, require_count
+from lidarlearn.data.progress import progress
 from lidarlearn.data.sequence import DataSet, LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.writable import writable
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation.drive import Drive, simulator_digest
@@ -172,11 +172,11 @@ class SimulatedDataSet(DataSet):
         return report
 
     def prepare(self, names: Iterable[str] | None = None) -> None:
-        """Make the scans that are missing, with a progress bar; safe when two processes do it, or one is killed."""
+        """Make the scans that are missing and show the progress; safe when two processes do it, or one is killed."""
         drives = [self._drive(name) for name in (self.names if names is None else dict.fromkeys(names))]
         if not any(_missing(self.folder(drive), range(self._wanted(drive))) for drive in drives):
             return
-        self.root.mkdir(parents=True, exist_ok=True)
+        writable(self.root, "data.root=/path/with/room, or the environment variable LIDARLEARN_DATA")
         with FileLock(self.root / "simulation.lock"):
             missing = [(d, self.folder(d), _missing(self.folder(d), range(self._wanted(d)))) for d in drives]
             jobs = [job for job in missing if job[2]]
@@ -242,9 +242,9 @@ def _make(jobs: list[_Job], workers: int) -> None:
     total = sum(len(indices) for _, _, indices in jobs)
     stop = threading.Event()
     # Threads do, and need no importable main module: ray casting and numpy's loops run without the interpreter's lock.
-    with Progress(transient=True) as progress, ThreadPoolExecutor(max(1, workers)) as pool:
-        bar = progress.add_task("Simulating drives", total=total)
-        running = {pool.submit(_work, portion, stop, partial(progress.advance, bar)) for portion in portions}
+    what = f"simulating {len(jobs)} drive{'s' if len(jobs) > 1 else ''}"
+    with progress(what, total) as advance, ThreadPoolExecutor(max(1, workers)) as pool:
+        running = {pool.submit(_work, portion, stop, advance) for portion in portions}
         try:
             for future in as_completed(running):
                 future.result()

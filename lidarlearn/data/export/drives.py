@@ -5,10 +5,10 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from rich.progress import track
 from torch import Tensor
 
 from lidarlearn.data.kitti_raw import sweep_times
+from lidarlearn.data.progress import tracked
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.errors import UserError
 
@@ -32,8 +32,8 @@ def write_shared(path: Path, text: str) -> None:
 
 
 def scans_of(drive: Sequence, name: str) -> Iterator[Scan]:
-    """All scans, with a progress bar."""
-    return iter(track(drive, f"writing sequence {name}", total=len(drive), transient=True))
+    """All scans, with their progress shown."""
+    return tracked(drive, f"writing sequence {name}", len(drive))
 
 
 def timestamps_of(drive: Sequence) -> Float[Tensor, "n"]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from lidarlearn.data.cloud_files import SUFFIXES
 from lidarlearn.data.export.folder import write_folder
 from lidarlearn.data.export.ford_campus import write_ford_campus
 from lidarlearn.data.export.kitti import write_kitti_odometry
@@ -21,7 +22,10 @@ from lidarlearn.data.kitti_raw import KittiRaw
 from lidarlearn.data.nclt import Nclt
 from lidarlearn.data.newer_college import NewerCollege
 from lidarlearn.data.sequence import DataSet, Sequence
+from lidarlearn.data.writable import writable
 from lidarlearn.errors import UserError
+
+_REMEDY = "to.root=/an/empty/folder"
 
 
 @dataclass(frozen=True)
@@ -65,18 +69,19 @@ def export(drive: Sequence, target: DataSet, name: str, suffix: str | None = Non
     Raises:
         UserError: the format cannot hold such a drive, or there is such a sequence already.
     """
-    write = require_writable(target, suffix).write
+    write = format_of(target, suffix).write
     require_new(target, name)
+    writable(target.root, _REMEDY)
     if suffix is not None:
         write = partial(write_folder, suffix=suffix)
     write(drive, target, name)
 
 
-def require_writable(target: DataSet, suffix: str | None = None) -> Format:
+def format_of(target: DataSet, suffix: str | None = None) -> Format:
     """How a data set is written.
 
     Raises:
-        UserError: it cannot be, or its scans have no choice of `suffix`.
+        UserError: it cannot be, or its scans cannot have that suffix.
     """
     form = _FORMATS.get(type(target))
     if form is None:
@@ -84,14 +89,15 @@ def require_writable(target: DataSet, suffix: str | None = None) -> Format:
         raise UserError(f"{target.title}: this data set cannot be written.\n  change: to={options}")
     if suffix is not None and not isinstance(target, Folder):
         raise UserError(f"{target.title} has its own kind of files.\n  change: leave out suffix={suffix}, or to=folder")
+    if suffix is not None and suffix not in SUFFIXES:
+        raise UserError(f"scans cannot be written as {suffix!r}.\n  change: suffix={'|'.join(SUFFIXES)}")
     return form
 
 
 def require_new(target: DataSet, name: str) -> None:
     """Raise UserError where anything of the sequence that is to be written is there already."""
-    for place in require_writable(target).places:
+    for place in format_of(target).places:
         for path in target.root.glob(place.format(glob.escape(name.removesuffix("_sync")))):
             raise UserError(
-                f"{path.absolute()} is there already, and is not written over.\n"
-                "  change: to.root=/an/empty/folder, or move it away"
+                f"{path.absolute()} is there already, and is not written over.\n  change: {_REMEDY}, or move it away"
             )
