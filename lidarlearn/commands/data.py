@@ -1,5 +1,7 @@
 """`python -m lidarlearn.data check|export ...`: describe a copy of a data set, or write it in the format of another."""
 
+import json
+import shlex
 import sys
 from collections.abc import Sequence
 
@@ -53,41 +55,47 @@ def check(overrides: Sequence[str], console: Console) -> bool:
 def export_all(overrides: Sequence[str], console: Console) -> bool:
     """Write the sequences of one data set in the format of another, and say how to train on them."""
     # imported late: the writers' libraries are of no use to a check
-    from lidarlearn.data.export.formats import export
+    from lidarlearn.data.export.formats import export, format_of, require_new
 
-    settings = dict(o.split("=", 1) for o in overrides if o.startswith("suffix="))
+    suffix = next((o.removeprefix("suffix=") for o in overrides if o.startswith("suffix=")), None)
+    of_target = [o.replace("to", "data", 1) for o in overrides if o.startswith(("to=", "to."))]
     source = compose_data_set([o for o in overrides if not o.startswith(("to=", "to.", "suffix="))])
-    of_target = [o for o in overrides if o.startswith(("to=", "to."))]
-    target = compose_data_set([o.replace("to", "data", 1) for o in of_target])
-    source.prepare()
-    written: dict[str, list[str]] = {role: [] for role in _ROLES}
-    for role, of_source, of_target_name in matched_sequences(source, target):
-        if any(of_target_name in names for names in written.values()):
-            console.print(f"{of_source} ({role}) is left out: there is a {of_target_name} already", markup=False)
-        else:
-            drive = source.sequence(of_source)
-            export(drive, target, of_target_name, **settings)
-            console.print(f"{of_source} ({role}) -> {of_target_name}: {len(drive)} scans", markup=False)
-        written[role].append(of_target_name)
-    names = " ".join(f"'data.{role}_sequences=[{','.join(map(repr, names))}]'" for role, names in written.items())
-    selection = next(o for o in of_target if o.startswith("to=")).replace("to", "data", 1)
-    root = next(o for o in of_target if o.startswith("to.root=")).removeprefix("to.root=")
-    console.print(f"train on it: python train.py {selection} data.root={root} {names}", markup=False)
+    target = compose_data_set(of_target)
+    format_of(target, suffix)
+    theirs = matched_names(source, target)
+    for name in theirs.values():
+        require_new(target, name)
+    source.prepare(theirs)
+    drives = {name: source.sequence(name) for name in theirs}
+    for mine, drive in drives.items():
+        export(drive, target, theirs[mine], suffix)
+        console.print(f"{mine} -> {theirs[mine]}: {len(drive)} scans", markup=False)
+    if left_out := [name for name in source.names if name not in theirs]:
+        console.print(f"left out, {target.title} has no more names for them: {', '.join(left_out)}", markup=False)
+    words = ["python", "train.py", *of_target]
+    for role in _ROLES:
+        names = [theirs[name] for name in getattr(source, f"{role}_sequences") if name in theirs]
+        words.append(f"data.{role}_sequences={json.dumps(names)}")
+    console.print(f"train on it: {shlex.join(words)}", markup=False)
     return True
 
 
-def matched_sequences(source: DataSet, target: DataSet) -> list[tuple[str, str, str]]:
-    """What each sequence is used for, its name, and its name in the target.
+def matched_names(source: DataSet, target: DataSet) -> dict[str, str]:
+    """The name in the target of each sequence of the source, whatever it is used for.
 
-    The n-th training sequence becomes the target's n-th, and so on; where the target lacks names of its own (a folder
-    of scans), names stay. A sequence beyond the target's last one is left out.
+    The n-th training sequence takes the target's n-th name that is still free, and so on; validation and test choose
+    first, so that training takes none of theirs. A folder of scans has no names of its own: there they stay. A
+    sequence for which no name is left is left out.
     """
-    matches = []
-    for role in _ROLES:
-        names: tuple[str, ...] = getattr(source, f"{role}_sequences")
-        theirs = names if target.title == "folder of scans" else getattr(target, f"{role}_sequences")
-        matches += [(role, mine, their) for mine, their in zip(names, theirs, strict=False)]
-    return matches
+    if target.title == "folder of scans":
+        return {name: name for name in source.names}
+    matched: dict[str, str] = {}
+    for role in reversed(_ROLES):
+        for name in getattr(source, f"{role}_sequences"):
+            free = (their for their in getattr(target, f"{role}_sequences") if their not in matched.values())
+            if name not in matched and (their := next(free, None)) is not None:
+                matched[name] = their
+    return {name: matched[name] for name in source.names if name in matched}
 
 
 def compose_data_set(overrides: Sequence[str]) -> DataSet:

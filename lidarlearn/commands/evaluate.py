@@ -81,7 +81,7 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     layout: TableLayout | None = instantiate(config.table, _convert_="all")
     data: DataSet = instantiate(config.data)
     data.prepare(data.test_sequences)
-    sequences = {name: data.sequence(name) for name in data.test_sequences}
+    sequences = data.sequences(data.test_sequences)
     if not sequences:
         raise UserError('data.test_sequences is empty\n  change: data.test_sequences=["..."]')
     write_run_description(run_folder, config)

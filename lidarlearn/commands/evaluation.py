@@ -54,7 +54,7 @@ def measure_convergence(config: DictConfig) -> None:
         raise UserError(f"backends={unknown}: choose among {', '.join(config.odometry)}")
     data: DataSet = instantiate(config.data)
     data.prepare(data.test_sequences)
-    sequences = [data.sequence(name) for name in data.test_sequences]
+    sequences = list(data.sequences(data.test_sequences).values())
     if len(sequences) != 1:
         raise UserError(f"data.test_sequences={list(data.test_sequences)}: one sequence is measured at a time")
     sequence, probe = sequences[0], instantiate(config.probe)

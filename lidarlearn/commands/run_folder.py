@@ -1,13 +1,13 @@
 """What every run leaves in its folder besides its results: the effective config and the revision of the code."""
 
-import hashlib
 import subprocess
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from lidarlearn.source_digest import PACKAGE, source_digest
+
 _SOURCE = Path(__file__).resolve().parent
-_PACKAGE = _SOURCE.parent
 
 
 def git_revision() -> str:
@@ -21,10 +21,7 @@ def git_revision() -> str:
 
 def code_digest() -> str:
     """Hash of the package's source: the same code gives the same results, committed or not."""
-    digest = hashlib.sha256()
-    for path in sorted(_PACKAGE.rglob("*.py")):
-        digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:12]
+    return source_digest(*PACKAGE.rglob("*.py"))
 
 
 def write_run_description(folder: Path, config: DictConfig) -> None:

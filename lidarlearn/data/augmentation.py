@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from lidarlearn.data.cache import to_16_bits
 from lidarlearn.data.pairs import Pair
 from lidarlearn.geometry import se3
 
@@ -68,13 +69,16 @@ def mirrored(pair: Pair) -> Pair:
 
 
 def turned(pair: Pair, columns: int) -> Pair:
-    """The pair as a sensor sees it that is turned, counter-clockwise, by the angle of so many columns."""
+    """The pair as a sensor sees it that is turned, counter-clockwise, by the angle of so many columns.
+
+    Points that 16 bits cannot hold any more, beyond 131 m along an axis, become empty pixels.
+    """
     angle = 2 * math.pi * columns / pair["reference"].shape[-1]
     M = se3.from_euler(torch.tensor([0, 0, 0, 0, 0, -angle], dtype=torch.float64))
 
     def turn(vertex_map: Shaped[Tensor, "3 h w"]) -> Shaped[Tensor, "3 h w"]:
         points = torch.einsum("ij,jhw->ihw", M[:3, :3].float(), vertex_map.float()).roll(columns, dims=-1)
-        return points if vertex_map.is_floating_point() else points.round().to(vertex_map.dtype)
+        return points if vertex_map.is_floating_point() else to_16_bits(points)
 
     return _seen_by(pair, turn(pair["reference"]), turn(pair["target"]), M)
 

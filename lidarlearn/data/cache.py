@@ -3,29 +3,34 @@
 import hashlib
 import json
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from filelock import FileLock, Timeout
 from jaxtyping import Float, Int16
-from rich.progress import track
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from lidarlearn.data.progress import tracked
 from lidarlearn.data.sequence import Sequence
+from lidarlearn.data.writable import writable
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.source_digest import source_digest
 
 QUANTUM_M = 0.004
 """Coordinates are stored in multiples of this [m]: below a sensor's noise, and 16 bits reach 131 m."""
 
-_VERSION = 1  # of the format; a new one leaves old caches alone
+_MAPS, _DONE = "vertex_maps.npy", "done.npy"
 _CHUNK = 32  # frames between two notes of what is done: at most so many are projected again after a kill
 _SPARE_BYTES = 50_000_000
+_REMEDY = "datamodule.cache_root=/path/with/room, or the environment variable LIDARLEARN_CACHE"
 
 
 class VertexMaps:
@@ -51,7 +56,12 @@ class VertexMaps:
 
 def encode(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Int16[Tensor, "*batch 3 h w"]:
     """Metres to multiples of `QUANTUM_M`; points beyond the range of 16 bits become empty pixels."""
-    multiples = (vertex_map / QUANTUM_M).round()
+    return to_16_bits(vertex_map / QUANTUM_M)
+
+
+def to_16_bits(multiples: Float[Tensor, "*batch 3 h w"]) -> Int16[Tensor, "*batch 3 h w"]:
+    """Rounded; a pixel of which a coordinate goes beyond the range becomes empty."""
+    multiples = multiples.round()
     inside = (multiples.abs() <= torch.iinfo(torch.int16).max).all(dim=-3, keepdim=True)
     return torch.where(inside, multiples, 0).to(torch.int16)
 
@@ -66,9 +76,12 @@ def cached_vertex_maps(
 ) -> VertexMaps:
     """The vertex maps of all scans of a sequence, projected now as far as they are not on disk yet.
 
-    The folder's name is a fingerprint of the scans and of the projection: other settings make another cache. Any
-    number of processes may ask at once: one projects, the others wait. A process killed half-way leaves what it had
-    finished to the next one.
+    The folder's name is a fingerprint of the scans, of the projection, and of the code that reads and projects: other
+    settings make another cache, and so does a changed reader. What earlier code made stays where it is, 280 kB a scan
+    in `cache_root`; `settings.json` in each folder says of which sequence, and any folder may be deleted at any time.
+
+    Any number of processes may ask at once: one projects, the others wait. A process killed half-way leaves what it
+    had finished to the next one.
 
     Args:
         sequence: whose scans are projected.
@@ -78,27 +91,32 @@ def cached_vertex_maps(
 
     Raises:
         DamagedFileError: a scan cannot be read.
-        UserError: the disk is too small.
+        UserError: the disk is too small, or cannot be written to.
     """
     folder = cache_root / _fingerprint(sequence, projection)
-    if not _complete(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    shape = (len(sequence), 3, projection.height, projection.width)
+    if not _complete(folder, shape):
+        writable(folder, _REMEDY)
         with _locked(folder / ".lock", sequence.name):
-            if not _complete(folder):
-                _build(folder, sequence, projection, num_workers)
-    return VertexMaps(folder / "vertex_maps.npy")
+            if not _complete(folder, shape):
+                _build(folder, shape, sequence, projection, num_workers)
+    return VertexMaps(folder / _MAPS)
 
 
 def _fingerprint(sequence: Sequence, projection: SphericalProjection) -> str:
-    settings = json.dumps([_VERSION, QUANTUM_M, sequence.fingerprint, len(sequence), asdict(projection)])
+    settings = json.dumps([_code(sequence), QUANTUM_M, sequence.fingerprint, len(sequence), asdict(projection)])
     return hashlib.sha256(settings.encode()).hexdigest()[:24]
 
 
-def _complete(folder: Path) -> bool:
-    try:
-        return (folder / "vertex_maps.npy").exists() and bool(np.load(folder / "done.npy").all())
-    except (OSError, ValueError, EOFError):  # not there, or just being made
-        return False
+def _code(sequence: Sequence) -> str:
+    """Digest of the sequence's reader and of this module, with all that they use."""
+    reader = getattr(sys.modules.get(type(sequence).__module__), "__file__", None)  # a notebook's class has none
+    return source_digest(*(Path(file) for file in (reader, __file__) if file))
+
+
+def _complete(folder: Path, shape: tuple[int, ...]) -> bool:
+    maps, done = _opened(folder / _MAPS, shape, np.int16), _opened(folder / _DONE, shape[:1], np.bool_)
+    return maps is not None and done is not None and bool(done.all())
 
 
 @contextmanager
@@ -116,15 +134,23 @@ def _locked(file: Path, name: str) -> Iterator[None]:
         lock.release()
 
 
-def _build(folder: Path, sequence: Sequence, projection: SphericalProjection, num_workers: int) -> None:
+def _build(
+    folder: Path, shape: tuple[int, ...], sequence: Sequence, projection: SphericalProjection, num_workers: int
+) -> None:
     """Project what is missing. Frames are flushed to disk before they are noted as done."""
-    shape = (len(sequence), 3, projection.height, projection.width)
-    if not (folder / "vertex_maps.npy").exists():
-        (folder / "done.npy").unlink(missing_ok=True)
-    maps = _open(folder / "vertex_maps.npy", shape, np.int16)
-    done = _open(folder / "done.npy", shape[:1], np.bool_)
+    maps = _opened(folder / _MAPS, shape, np.int16, "r+")
+    if maps is None:
+        (folder / _DONE).unlink(missing_ok=True)  # it was said of other maps
+        maps = _new(folder / _MAPS, shape, np.int16)
+    done = _opened(folder / _DONE, shape[:1], np.bool_, "r+")
+    if done is None:
+        done = _new(folder / _DONE, shape[:1], np.bool_)
     (folder / "settings.json").write_text(
-        json.dumps({"sequence": sequence.name, "fingerprint": sequence.fingerprint, **asdict(projection)}, indent=2)
+        json.dumps(
+            {"sequence": sequence.name, "fingerprint": sequence.fingerprint, "code": _code(sequence)}
+            | asdict(projection),
+            indent=2,
+        )
     )
     missing = np.flatnonzero(~done).tolist()
     scans = DataLoader(
@@ -134,7 +160,7 @@ def _build(folder: Path, sequence: Sequence, projection: SphericalProjection, nu
         generator=torch.Generator(),  # leaves the global one alone: a training is the same with or without a cache
     )
     finished: list[int] = []
-    for index, vertex_map in track(scans, f"projecting sequence {sequence.name}", total=len(missing)):
+    for index, vertex_map in tracked(scans, f"projecting sequence {sequence.name}", len(missing)):
         if isinstance(vertex_map, UserError):
             raise vertex_map
         maps[index] = vertex_map.numpy()
@@ -145,21 +171,25 @@ def _build(folder: Path, sequence: Sequence, projection: SphericalProjection, nu
             done.flush()
 
 
-def _open(file: Path, shape: tuple[int, ...], dtype: type) -> np.memmap:
-    """A .npy file mapped for writing: the one that is there if it fits, else a new one of zeros."""
-    if file.exists():
-        try:
-            array = np.lib.format.open_memmap(file, mode="r+")
-            if array.shape == shape and array.dtype == dtype:
-                return array
-        except ValueError:  # killed while the file was being made
-            pass
+def _opened(file: Path, shape: tuple[int, ...], dtype: type, mode: Literal["r", "r+"] = "r") -> np.memmap | None:
+    """A .npy file mapped into memory; None where it is absent, truncated or holds something else."""
+    try:
+        array = np.lib.format.open_memmap(file, mode="r")  # mapped for writing, a short file would be filled with zeros
+        if array.shape != shape or array.dtype != dtype:
+            return None
+        return array if mode == "r" else np.lib.format.open_memmap(file, mode=mode)
+    except (OSError, ValueError, EOFError):
+        return None
+
+
+def _new(file: Path, shape: tuple[int, ...], dtype: type) -> np.memmap:
+    """A .npy file of zeros, mapped for writing."""
     needed = int(np.prod(shape)) * np.dtype(dtype).itemsize
     free = shutil.disk_usage(file.parent).free
     if free < needed + _SPARE_BYTES:  # a full disk under a mapped file kills the process without a word
         raise UserError(
             f"{file.parent.absolute()}: {needed / 1e9:.2f} GB of vertex maps do not fit, {free / 1e9:.2f} GB are free."
-            "\n  change: datamodule.cache_root=/path/with/room, or train on fewer scans (data.max_frames)"
+            f"\n  change: {_REMEDY}, or train on fewer scans (data.max_frames)"
         )
     return np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=shape)
 

@@ -1,6 +1,7 @@
 """The pairs of a data set's sequences as Lightning wants them."""
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -63,10 +64,15 @@ class OdometryDataModule(LightningDataModule):
         Raises:
             DataSetNotFoundError: something that is needed is missing.
             DamagedFileError: a scan, or poses, cannot be read.
+            UserError: a sequence lacks the ground truth that the module `needs_ground_truth` for.
         """
         self.data.prepare()
-        for name in dict.fromkeys([*self.data.train_sequences, *self.data.val_sequences]):
-            self._vertex_maps(self.data.sequence(name))
+        # All are opened first: what is missing or unlabelled is told before minutes of projecting.
+        sequences = self.data.sequences(dict.fromkeys([*self.data.train_sequences, *self.data.val_sequences]))
+        if self.trainer is not None and getattr(self.trainer.lightning_module, "needs_ground_truth", False):
+            _require_ground_truth(sequences)
+        for sequence in sequences.values():
+            self._vertex_maps(sequence)
 
     def setup(self, stage: str | None = None) -> None:
         """Open sequences and caches; called in every process."""
@@ -115,6 +121,15 @@ class OdometryDataModule(LightningDataModule):
             num_workers=self.num_workers,
             persistent_workers=self.num_workers > 0,
             pin_memory=torch.cuda.is_available(),
+        )
+
+
+def _require_ground_truth(sequences: Mapping[str, Sequence]) -> None:
+    without = [name for name, sequence in sequences.items() if sequence.T_world_lidar is None]
+    if without:
+        raise UserError(
+            f"loss=supervised needs ground truth, and there is none of {', '.join(without)}.\n"
+            "  change: data.train_sequences and data.val_sequences to those that have it, or loss=weighted_icp"
         )
 
 

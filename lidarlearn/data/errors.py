@@ -4,6 +4,11 @@ from pathlib import Path
 
 from lidarlearn.errors import UserError
 
+ROOT_REMEDY = (
+    "data.root=/path/to/your/copy, or the environment variable LIDARLEARN_DATA to the folder that holds"
+    " kitti_odometry, kitti_raw, nclt, ..."
+)
+
 
 class DataSetNotFoundError(UserError):
     """A data set, or a part of it that is needed, is not where it was looked for.
@@ -13,14 +18,14 @@ class DataSetNotFoundError(UserError):
         missing: what was not found.
         looked_in: the path where it was looked for.
         source: where the data comes from.
-        setting: the setting that says where to look.
+        remedy: which setting to change.
     """
 
-    def __init__(self, name: str, missing: str, looked_in: Path, source: str, setting: str = "data.root") -> None:
+    def __init__(self, name: str, missing: str, looked_in: Path, source: str, remedy: str = ROOT_REMEDY) -> None:
         super().__init__(
             f"{name}: {missing} not found.\n"
             f"  looked in: {looked_in.absolute()}\n"
-            f"  change:    {setting}=/path/to/your/copy, or the environment variable LIDARLEARN_DATA\n"
+            f"  change:    {remedy}\n"
             f"  get it:    {source}"
         )
 
@@ -36,3 +41,14 @@ class DamagedFileError(UserError):
 
     def __init__(self, path: Path, problem: str, remedy: str = "copy or download this file again") -> None:
         super().__init__(f"{path.absolute()}: {problem}.\n  change: {remedy}")
+
+
+def one_line(message: object) -> str:
+    """An error's message for a table or a list."""
+    return " ".join(line.strip() for line in str(message).splitlines())
+
+
+def require_count(setting: str, value: int | None) -> None:
+    """Raise UserError unless a setting is an integer of at least 1, or None."""
+    if value is not None and (not isinstance(value, int) or value < 1):
+        raise UserError(f"{setting}={value}: nothing would be left.\n  change: {setting} to an integer of at least 1")

@@ -7,7 +7,6 @@ KITTI rows belong to the scans in order; TUM rows are interpolated at the scans'
 where these have no times. Poses relate to the middle of a sweep.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,15 +17,15 @@ from torch import Tensor
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.cloud_files import SUFFIXES, read_cloud
-from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import interpolate_poses
-from lidarlearn.data.pose_files import read_kitti_poses, read_numbers, read_tum_poses, start_at_identity
-from lidarlearn.data.scan_files import ScanFiles, holds_scans, list_scans, sequence_names, subfolders
-from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.pose_files import read_kitti_poses, read_lines, read_numbers, read_tum_poses, start_at_identity
+from lidarlearn.data.scan_files import ScanFiles, holds_scans, list_scans, subfolders
+from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 
-_SOURCE = "your own recordings: one folder of .bin, .npy, .pcd or .ply files for each sequence"
 _TRUTH_INSIDE = ("poses.txt", "poses.tum", "groundtruth.txt")
 
 
@@ -78,7 +77,7 @@ class FolderSequence(Sequence):
         )
 
 
-class Folder(DataSet):
+class Folder(DataSetOnDisk):
     """A folder of scans.
 
     Args:
@@ -95,29 +94,26 @@ class Folder(DataSet):
     """
 
     title = "folder of scans"
+    source = "your own recordings: one folder of .bin, .npy, .pcd or .ply files for each sequence"
+    marker = "scans and no folder of scans"
 
     def __init__(
         self,
         root: str | Path,
         projection: SphericalProjection,
-        train_sequences: Iterable[str | int] | None = None,
-        val_sequences: Iterable[str | int] | None = None,
-        test_sequences: Iterable[str | int] | None = None,
+        train_sequences: Names | None = None,
+        val_sequences: Names | None = None,
+        test_sequences: Names | None = None,
         max_frames: int | None = None,
         deskew: bool = False,
         beam_correction_deg: float | int = 0.0,
         bin_columns: int = 4,
         max_intensity: float | int | None = None,
     ) -> None:
-        self.root = Path(root)
-        self.projection = projection
-        there = find_sequences(self.root) or (self.root.absolute().name,)
-        self.train_sequences = there if train_sequences is None else sequence_names(train_sequences)
-        self.val_sequences = there if val_sequences is None else sequence_names(val_sequences)
-        self.test_sequences = there if test_sequences is None else sequence_names(test_sequences)
-        self.max_frames = max_frames
-        self.deskew = deskew
-        self.beam_correction_deg = float(beam_correction_deg)
+        root = Path(root).expanduser()
+        there = find_sequences(root) or (root.absolute().name,)
+        train, val, test = (there if n is None else n for n in (train_sequences, val_sequences, test_sequences))
+        super().__init__(root, projection, train, val, test, max_frames, deskew, beam_correction_deg)
         self.bin_columns = bin_columns
         self.max_intensity = None if max_intensity is None else float(max_intensity)
 
@@ -126,7 +122,7 @@ class Folder(DataSet):
         folder = self._folder(name)
         files = list_scans(folder, SUFFIXES)
         if not len(files):
-            raise self._not_found(f"{name}: scans (.bin, .npy, .pcd or .ply)")
+            raise self.not_found(name, f"{name}: scans (.bin, .npy, .pcd or .ply)")
         if len(kinds := _kinds(files)) > 1:
             raise UserError(
                 f"{folder}: scans of several kinds ({', '.join(kinds)}).\n  change: keep one kind in a folder"
@@ -146,19 +142,17 @@ class Folder(DataSet):
             beam_correction_deg=self.beam_correction_deg,
         )
 
-    def check(self) -> LayoutReport:
-        """Describe this folder by names and sizes."""
-        report = LayoutReport()
-        if layout.describe_root(report, self.root, _is_root, "scans and no folder of scans", _SOURCE):
-            there = {name: list_scans(self._folder(name), SUFFIXES) for name in find_sequences(self.root)}
-            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
-            for name in configured:
-                self._check_sequence(report, name)
-            layout.describe_unconfigured(report, there, configured)
-            layout.suggest_sequences(report, there)
-        return report
+    @staticmethod
+    def is_root(path: Path) -> bool:
+        """Whether it holds scans, or folders of scans."""
+        return bool(find_sequences(path))
 
-    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+    def found(self) -> dict[str, ScanFiles]:
+        """All subfolders with scans, or the folder itself."""
+        return {name: list_scans(self._folder(name), SUFFIXES) for name in find_sequences(self.root)}
+
+    def check_sequence(self, report: LayoutReport, name: str) -> None:
+        """Scans of one kind, times and ground truth."""
         folder = self._folder(name)
         if not folder.is_dir():
             report.missing(name, f"no folder {name}")
@@ -191,7 +185,7 @@ class Folder(DataSet):
         path = self._ground_truth_file(folder)
         if path is None:
             return None
-        columns = len(path.read_text().partition("\n")[0].split())
+        columns = len(next(iter(read_lines(path)), "").split())
         T_world = read_kitti_poses(path) if columns == 12 else None
         if T_world is None:
             stamped = read_tum_poses(path)
@@ -201,9 +195,6 @@ class Folder(DataSet):
         if len(T_world) != count:
             raise DamagedFileError(path, f"{len(T_world)} poses for {count} scans", "give every scan a row or a time")
         return start_at_identity(T_world)
-
-    def _not_found(self, missing: str) -> DataSetNotFoundError:
-        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
 
 
 def find_sequences(root: Path) -> tuple[str, ...]:
@@ -245,7 +236,3 @@ def _timestamps(folder: Path, count: int) -> Float[Tensor, "n"] | None:
 
 def _kinds(scans: ScanFiles) -> list[str]:
     return sorted({Path(name).suffix.lower() for name in scans.names})
-
-
-def _is_root(path: Path) -> bool:
-    return bool(find_sequences(path))

@@ -11,11 +11,10 @@ PARAM.mat and paper place the laser at (2.4, -0.01, -2.3) m, (180, 0, 90) deg in
 which for turned points reads [2.4, -0.01, -2.3, 180, 0, 0].
 """
 
-import hashlib
 import logging
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from rich.progress import track
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 from scipy.spatial.transform import Rotation
@@ -33,15 +31,16 @@ from torch import Tensor
 
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import as_transforms, start_at_identity
-from lidarlearn.data.scan_files import ScanFiles, list_scans, sequence_names, subfolders, warn_of_gaps
-from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.data.progress import tracked
+from lidarlearn.data.scan_files import ScanFiles, list_scans, subfolders, warn_of_gaps
+from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 
 _log = logging.getLogger(__name__)
 
-_SOURCE = "http://robots.engin.umich.edu/SoftwareData/Ford (dataset-1 and dataset-2)"
 _POSES_FILE = "lidarlearn_poses.npz"
 _SMALLEST_BYTES = 1000  # of a file that holds a scan
 
@@ -89,7 +88,7 @@ class FordCampusSequence(Sequence):
         )
 
 
-class FordCampus(DataSet):
+class FordCampus(DataSetOnDisk):
     """Ford Campus.
 
     Args:
@@ -106,39 +105,45 @@ class FordCampus(DataSet):
     """
 
     title = "Ford Campus"
+    source = "http://robots.engin.umich.edu/SoftwareData/Ford (dataset-1 and dataset-2)"
+    marker = "folder like IJRR-Dataset-1 with SCANS in it"
 
     def __init__(
         self,
         root: str | Path,
         projection: SphericalProjection,
-        train_sequences: Iterable[str | int],
-        val_sequences: Iterable[str | int],
-        test_sequences: Iterable[str | int],
+        train_sequences: Names,
+        val_sequences: Names,
+        test_sequences: Names,
         max_frames: int | None = None,
         deskew: bool = False,
         beam_correction_deg: float | int = 0.0,
         min_range_m: float | int = 8.0,
         T_vehicle_lidar_m_deg: Iterable[float | int] = (0, 0, 0, 0, 0, 0),
     ) -> None:
-        self.root = Path(root)
-        self.projection = projection
-        self.train_sequences = sequence_names(train_sequences)
-        self.val_sequences = sequence_names(val_sequences)
-        self.test_sequences = sequence_names(test_sequences)
-        self.max_frames = max_frames
-        self.deskew = deskew
-        self.beam_correction_deg = float(beam_correction_deg)
+        super().__init__(
+            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
+        )
         self.min_range_m = float(min_range_m)
         self.T_vehicle_lidar = _from_degrees(np.array([list(T_vehicle_lidar_m_deg)], dtype=np.float64))[0]
 
     def sequence(self, name: str) -> FordCampusSequence:
         """Open a drive; the first time this reads every scan for its pose."""
+        scans = self._scans(name).first(self.max_frames)
+        return self._open(name, scans, read_poses)
+
+    def open_for_check(self, name: str) -> FordCampusSequence:
+        """Open a drive of one scan: reading all for their poses takes minutes."""
+        return self._open(name, self._scans(name).first(1), lambda _, scans: _read_pose(scans.path(0))[None])
+
+    def _open(
+        self, name: str, scans: ScanFiles, read: Callable[[str, ScanFiles], NDArray[np.float64]]
+    ) -> FordCampusSequence:
         layout.refuse_deskew(self.title, self.deskew)
-        scans = list_scans(self.root / name / "SCANS", (".mat",)).first(self.max_frames)
         if not len(scans):
-            raise self._not_found(f"{name}/SCANS/Scan*.mat")
+            raise self.not_found(name, f"{name}/SCANS/Scan*.mat")
         warn_of_gaps(name, scans)
-        stamped = read_poses(name, scans)
+        stamped = read(name, scans)
         T_world_vehicle = _from_degrees(np.concatenate([stamped[:, 1:4], np.degrees(stamped[:, 4:])], axis=1))
         return FordCampusSequence(
             name=name,
@@ -149,28 +154,25 @@ class FordCampus(DataSet):
             beam_correction_deg=self.beam_correction_deg,
         )
 
-    def check(self) -> LayoutReport:
-        """Describe this copy by names and sizes."""
-        report = LayoutReport()
-        if layout.describe_root(report, self.root, _is_root, "folder like IJRR-Dataset-1 with SCANS in it", _SOURCE):
-            drives = [folder for folder in subfolders(self.root) if (folder / "SCANS").is_dir()]
-            there = {folder.name: list_scans(folder / "SCANS", (".mat",)) for folder in drives}
-            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
-            for name in configured:
-                self._check_sequence(report, name)
-            layout.describe_unconfigured(report, there, configured)
-            layout.suggest_sequences(report, there)
-        return report
+    def _scans(self, name: str) -> ScanFiles:
+        return list_scans(self.root / name / "SCANS", (".mat",), r"Scan\d+")
 
-    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+    @staticmethod
+    def is_root(path: Path) -> bool:
+        """Whether it holds drives with scans."""
+        return any((folder / "SCANS").is_dir() for folder in subfolders(path))
+
+    def found(self) -> dict[str, ScanFiles]:
+        """All drives."""
+        return {folder.name: self._scans(folder.name) for folder in subfolders(self.root)}
+
+    def check_sequence(self, report: LayoutReport, name: str) -> None:
+        """Scans alone: they hold everything else."""
         if not (self.root / name).is_dir():
             report.missing(name, f"no folder {name}")
             return
-        scans = list_scans(self.root / name / "SCANS", (".mat",))
+        scans = self._scans(name)
         layout.describe_scans(report, name, scans, bytes_per_point=None, smallest_bytes=_SMALLEST_BYTES)
-
-    def _not_found(self, missing: str) -> DataSetNotFoundError:
-        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
 
 
 def read_scan(path: Path) -> np.void:
@@ -192,12 +194,12 @@ def read_poses(name: str, scans: ScanFiles) -> NDArray[np.float64]:
         DamagedFileError: a scan cannot be read or its pose is not finite.
     """
     kept = scans.folder.parent / _POSES_FILE
-    key = hashlib.sha256(repr((scans.names, scans.sizes)).encode()).hexdigest()
+    key = scans.fingerprint("poses")
     if (stamped := _kept_poses(kept, key)) is not None:
         return stamped
     with ThreadPoolExecutor() as pool:  # inflating the files runs beside python
         rows = pool.map(_read_pose, (scans.path(i) for i in range(len(scans))))
-        stamped = np.stack(list(track(rows, f"poses of {name}", total=len(scans), transient=True)))
+        stamped = np.stack(list(tracked(rows, f"reading the poses of {name}", len(scans))))
     try:
         np.savez(kept, key=key, stamped=stamped)
     except OSError as error:
@@ -237,7 +239,3 @@ def _from_degrees(poses: NDArray[np.float64]) -> Float[Tensor, "n 4 4"]:
     """Transforms of x, y, z [m], roll, pitch, yaw [deg] with R = Rz Ry Rx."""
     R = Rotation.from_euler("ZYX", poses[:, [5, 4, 3]], degrees=True).as_matrix()
     return as_transforms(torch.from_numpy(np.concatenate([R, poses[:, :3, None]], axis=2)))
-
-
-def _is_root(path: Path) -> bool:
-    return any((folder / "SCANS").is_dir() for folder in subfolders(path))

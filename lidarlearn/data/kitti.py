@@ -5,7 +5,6 @@ reflectance in the LiDAR's frame. Poses are those of the left camera; `Tr` in ca
 number selects its row of poses and times, so a copy may hold any part of the scans.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,20 +14,19 @@ from torch import Tensor
 
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.pose_files import as_transforms, read_kitti_poses, read_numbers, start_at_identity
+from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.pose_files import as_transforms, read_kitti_poses, read_lines, read_numbers, start_at_identity
 from lidarlearn.data.scan_files import (
     ScanFiles,
     list_scans,
     read_float32_rows,
-    sequence_names,
     subfolders,
     warn_of_gaps,
 )
-from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 
-_SOURCE = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php (velodyne, calibration, ground truth poses)"
 _WITH_GROUND_TRUTH = tuple(f"{i:02d}" for i in range(11))
 
 
@@ -67,7 +65,7 @@ class KittiOdometrySequence(Sequence):
         return self.scans.fingerprint("KittiOdometry", beam_correction_deg=self.beam_correction_deg)
 
 
-class KittiOdometry(DataSet):
+class KittiOdometry(DataSetOnDisk):
     """KITTI odometry.
 
     Args:
@@ -82,36 +80,34 @@ class KittiOdometry(DataSet):
     """
 
     title = "KITTI odometry"
+    digits = 2
+    source = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php (velodyne, calibration, ground truth poses)"
+    marker = "folder 'sequences'"
 
     def __init__(
         self,
         root: str | Path,
         projection: SphericalProjection,
-        train_sequences: Iterable[str | int],
-        val_sequences: Iterable[str | int],
-        test_sequences: Iterable[str | int],
+        train_sequences: Names,
+        val_sequences: Names,
+        test_sequences: Names,
         max_frames: int | None = None,
         deskew: bool = False,
         beam_correction_deg: float | int = 0.205,
     ) -> None:
-        self.root = Path(root)
-        self.projection = projection
-        self.train_sequences = sequence_names(train_sequences, digits=2)
-        self.val_sequences = sequence_names(val_sequences, digits=2)
-        self.test_sequences = sequence_names(test_sequences, digits=2)
-        self.max_frames = max_frames
-        self.deskew = deskew
-        self.beam_correction_deg = float(beam_correction_deg)
+        super().__init__(
+            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
+        )
 
     def sequence(self, name: str) -> KittiOdometrySequence:
         """Open a sequence."""
         layout.refuse_deskew(self.title, self.deskew)
         folder = self.root / "sequences" / name
-        scans = list_scans(folder / "velodyne", (".bin",)).first(self.max_frames)
+        scans = self._scans(name).first(self.max_frames)
         if not len(scans):
-            raise self._not_found(f"sequences/{name}/velodyne/*.bin")
+            raise self.not_found(name, f"sequences/{name}/velodyne/*.bin")
         if not (folder / "calib.txt").is_file():
-            raise self._not_found(f"sequences/{name}/calib.txt")
+            raise self.not_found(name, f"sequences/{name}/calib.txt")
         warn_of_gaps(name, scans)
         T_camera_lidar = read_velodyne_calibration(folder / "calib.txt")
         return KittiOdometrySequence(
@@ -123,24 +119,22 @@ class KittiOdometry(DataSet):
             beam_correction_deg=self.beam_correction_deg,
         )
 
-    def check(self) -> LayoutReport:
-        """Describe this copy by names, sizes and the lengths of text files."""
-        report = LayoutReport()
-        if layout.describe_root(report, self.root, _is_root, "folder 'sequences'", _SOURCE):
-            there = {f.name: list_scans(f / "velodyne", (".bin",)) for f in subfolders(self.root / "sequences")}
-            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
-            for name in configured:
-                self._check_sequence(report, name)
-            layout.describe_unconfigured(report, there, configured)
-            layout.suggest_sequences(report, there)
-        return report
+    @staticmethod
+    def is_root(path: Path) -> bool:
+        """Whether it holds `sequences`."""
+        return (path / "sequences").is_dir()
 
-    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+    def found(self) -> dict[str, ScanFiles]:
+        """All folders of `sequences`."""
+        return {folder.name: self._scans(folder.name) for folder in subfolders(self.root / "sequences")}
+
+    def check_sequence(self, report: LayoutReport, name: str) -> None:
+        """Scans, calibration, times and poses."""
         folder = self.root / "sequences" / name
         if not folder.is_dir():
             report.missing(name, f"no folder sequences/{name}")
             return
-        scans = list_scans(folder / "velodyne", (".bin",))
+        scans = self._scans(name)
         layout.describe_scans(report, name, scans, bytes_per_point=16)
         if not (folder / "calib.txt").is_file():
             report.missing(name, "no calib.txt")
@@ -149,6 +143,9 @@ class KittiOdometry(DataSet):
         if name in _WITH_GROUND_TRUTH:
             poses = self.root / "poses" / f"{name}.txt"
             layout.describe_rows(report, name, poses, "poses", rows_needed, needed=name in self.test_sequences)
+
+    def _scans(self, name: str) -> ScanFiles:
+        return list_scans(self.root / "sequences" / name / "velodyne", (".bin",), r"\d{6}")
 
     def _ground_truth(
         self, name: str, scans: ScanFiles, T_camera_lidar: Float[Tensor, "4 4"]
@@ -167,9 +164,6 @@ class KittiOdometry(DataSet):
         _require_rows(path, len(times), scans)
         return times[scans.numbers]
 
-    def _not_found(self, missing: str) -> DataSetNotFoundError:
-        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
-
 
 def read_velodyne_calibration(path: Path) -> Float[Tensor, "4 4"]:
     """`Tr` of a KITTI odometry calib.txt: T_camera_lidar, to the left camera.
@@ -177,7 +171,7 @@ def read_velodyne_calibration(path: Path) -> Float[Tensor, "4 4"]:
     Raises:
         DamagedFileError: no such line, or not twelve numbers.
     """
-    lines = [line.partition(":")[2] for line in path.read_text().splitlines() if line.startswith("Tr:")]
+    lines = [line.partition(":")[2] for line in read_lines(path) if line.startswith("Tr:")]
     try:
         numbers = torch.tensor([float(value) for value in lines[0].split()], dtype=torch.float64)
         return as_transforms(numbers.reshape(3, 4))
@@ -189,7 +183,3 @@ def _require_rows(path: Path, rows: int, scans: ScanFiles) -> None:
     if rows <= max(scans.numbers):
         last = scans.names[max(range(len(scans)), key=scans.numbers.__getitem__)]
         raise DamagedFileError(path, f"{rows} rows, too few for scan {last} in {scans.folder}")
-
-
-def _is_root(path: Path) -> bool:
-    return (path / "sequences").is_dir()

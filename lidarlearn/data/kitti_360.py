@@ -7,7 +7,6 @@ pose of the GPS/IMU when the laser faced forward; scans without one (the car sto
 time. The laser turns as in KITTI raw, and point times follow likewise.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,16 +17,23 @@ from torch import Tensor
 
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.kitti_raw import sweep_times
+from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.oxts import read_timestamps
-from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, require_finite, start_at_identity
-from lidarlearn.data.scan_files import ScanFiles, list_scans, read_float32_rows, sequence_names, subfolders
-from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.data.pose_files import (
+    StampedPoses,
+    as_transforms,
+    read_lines,
+    read_numbers,
+    require_finite,
+    start_at_identity,
+)
+from lidarlearn.data.scan_files import ScanFiles, list_scans, read_float32_rows, subfolders
+from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 
-_SOURCE = "https://www.cvlibs.net/datasets/kitti-360/ (raw Velodyne scans, calibrations, vehicle poses)"
 _PREFIX, _SUFFIX = "2013_05_28_drive_", "_sync"
 
 
@@ -64,7 +70,7 @@ class Kitti360Sequence(Sequence):
         return self.scans.fingerprint("Kitti360", beam_correction_deg=self.beam_correction_deg)
 
 
-class Kitti360(DataSet):
+class Kitti360(DataSetOnDisk):
     """KITTI-360.
 
     Args:
@@ -79,35 +85,33 @@ class Kitti360(DataSet):
     """
 
     title = "KITTI-360"
+    digits = 4
+    source = "https://www.cvlibs.net/datasets/kitti-360/ (raw Velodyne scans, calibrations, vehicle poses)"
+    marker = "folder data_3d_raw with drives"
 
     def __init__(
         self,
         root: str | Path,
         projection: SphericalProjection,
-        train_sequences: Iterable[str | int],
-        val_sequences: Iterable[str | int],
-        test_sequences: Iterable[str | int],
+        train_sequences: Names,
+        val_sequences: Names,
+        test_sequences: Names,
         max_frames: int | None = None,
         deskew: bool = True,
         beam_correction_deg: float | int = 0.0,
     ) -> None:
-        self.root = Path(root)
-        self.projection = projection
-        self.train_sequences = sequence_names(train_sequences, digits=4)
-        self.val_sequences = sequence_names(val_sequences, digits=4)
-        self.test_sequences = sequence_names(test_sequences, digits=4)
-        self.max_frames = max_frames
-        self.deskew = deskew
-        self.beam_correction_deg = float(beam_correction_deg)
+        super().__init__(
+            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
+        )
 
     def sequence(self, name: str) -> Kitti360Sequence:
         """Open a drive; scans before its first and after its last pose are left out."""
         scans = self._scans(name)
         if not len(scans):
-            raise self._not_found(f"data_3d_raw/{drive_folder(name)}/velodyne_points/data/*.bin")
+            raise self.not_found(name, f"data_3d_raw/{drive_folder(name)}/velodyne_points/data/*.bin")
         stamps = self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "timestamps.txt"
         if not stamps.is_file():
-            raise self._not_found(str(stamps.relative_to(self.root)))
+            raise self.not_found(name, str(stamps.relative_to(self.root)))
         truth = self._poses(name, stamps)
         if truth is not None:
             scans = covered(name, scans, read_timestamps(stamps, scans.numbers), truth.timestamps)
@@ -118,7 +122,7 @@ class Kitti360(DataSet):
         T_world_lidar = None
         if truth is not None:
             T_world_lidar = start_at_identity(
-                interpolate_poses(truth.timestamps, truth.T_world_body, timestamps) @ self._calibration()
+                interpolate_poses(truth.timestamps, truth.T_world_body, timestamps) @ self._calibration(name)
             )
         return Kitti360Sequence(
             name=name,
@@ -128,24 +132,19 @@ class Kitti360(DataSet):
             beam_correction_deg=self.beam_correction_deg,
         )
 
-    def check(self) -> LayoutReport:
-        """Describe this copy by names, sizes and the lengths of text files."""
-        report = LayoutReport()
-        if layout.describe_root(report, self.root, _is_root, "folder data_3d_raw with drives", _SOURCE):
-            drives = [folder.name for folder in subfolders(self.root / "data_3d_raw")]
-            names = [name.removeprefix(_PREFIX).removesuffix(_SUFFIX) for name in drives if name.startswith(_PREFIX)]
-            there = {name: self._scans(name) for name in names}
-            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
-            for name in configured:
-                self._check_sequence(report, name)
-            for file in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt"):
-                if not (self.root / "calibration" / file).is_file():
-                    report.missing("calibration", f"no calibration/{file}")
-            layout.describe_unconfigured(report, there, configured)
-            layout.suggest_sequences(report, there)
-        return report
+    @staticmethod
+    def is_root(path: Path) -> bool:
+        """Whether it holds `data_3d_raw`."""
+        return (path / "data_3d_raw").is_dir()
 
-    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+    def found(self) -> dict[str, ScanFiles]:
+        """All drives."""
+        drives = [folder.name for folder in subfolders(self.root / "data_3d_raw")]
+        names = [name.removeprefix(_PREFIX).removesuffix(_SUFFIX) for name in drives if name.startswith(_PREFIX)]
+        return {name: self._scans(name) for name in names}
+
+    def check_sequence(self, report: LayoutReport, name: str) -> None:
+        """Scans, their times and poses; the calibration shows when the drive is opened."""
         folder = self.root / "data_3d_raw" / drive_folder(name)
         if not folder.is_dir():
             report.missing(name, f"no folder {folder.relative_to(self.root)}")
@@ -163,7 +162,9 @@ class Kitti360(DataSet):
             note(name, f"no ground truth: no {poses.relative_to(self.root)}")
 
     def _scans(self, name: str) -> ScanFiles:
-        return list_scans(self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "data", (".bin",))
+        return list_scans(
+            self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "data", (".bin",), r"\d{10}"
+        )
 
     def _poses_file(self, name: str) -> Path:
         return self.root / "data_poses" / drive_folder(name) / "poses.txt"
@@ -180,18 +181,15 @@ class Kitti360(DataSet):
         times = read_timestamps(stamps, rows[:, 0].astype(int).tolist())
         return StampedPoses(times, as_transforms(torch.from_numpy(rows[:, 1:]).reshape(-1, 3, 4)))
 
-    def _calibration(self) -> Float[Tensor, "4 4"]:
+    def _calibration(self, name: str) -> Float[Tensor, "4 4"]:
         """T_imu_lidar."""
-        paths = [self.root / "calibration" / name for name in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt")]
+        paths = [self.root / "calibration" / file for file in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt")]
         for path in paths:
             if not path.is_file():
-                raise self._not_found(str(path.relative_to(self.root)))
+                raise self.not_found(name, str(path.relative_to(self.root)))
         T_imu_camera = _transform(paths[0], "image_00:")
         T_lidar_camera = _transform(paths[1], "")
         return T_imu_camera @ torch.linalg.inv(T_lidar_camera)
-
-    def _not_found(self, missing: str) -> DataSetNotFoundError:
-        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
 
 
 def drive_folder(name: str) -> str:
@@ -205,13 +203,9 @@ def _transform(path: Path, label: str) -> Float[Tensor, "4 4"]:
     Raises:
         DamagedFileError: no such line, or not twelve numbers.
     """
-    lines = [line.removeprefix(label) for line in path.read_text().splitlines() if line.startswith(label)]
+    lines = [line.removeprefix(label) for line in read_lines(path) if line.startswith(label)]
     try:
         numbers = torch.tensor([float(value) for value in lines[0].split()], dtype=torch.float64)
         return as_transforms(numbers.reshape(3, 4))
     except (IndexError, ValueError, RuntimeError) as error:
         raise DamagedFileError(path, f"no line {label!r} with twelve numbers") from error
-
-
-def _is_root(path: Path) -> bool:
-    return (path / "data_3d_raw").is_dir()

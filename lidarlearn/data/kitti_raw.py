@@ -10,7 +10,6 @@ keep their number where the recording dropped some; the dropped ones are blank l
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,20 +22,18 @@ from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.interpolation import interpolate_poses
+from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.oxts import read_oxts_poses, read_rigid_transform, read_timestamps
 from lidarlearn.data.pose_files import start_at_identity
 from lidarlearn.data.scan_files import (
     ScanFiles,
     list_scans,
     read_float32_rows,
-    sequence_names,
     subfolders,
     warn_of_gaps,
 )
-from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
-
-_SOURCE = "https://www.cvlibs.net/datasets/kitti/raw_data.php ([synced+rectified data] and [calibration] of a drive)"
 
 
 @dataclass(frozen=True)
@@ -103,7 +100,7 @@ class KittiRawSequence(Sequence):
         return self.scans.fingerprint("KittiRaw", beam_correction_deg=self.beam_correction_deg)
 
 
-class KittiRaw(DataSet):
+class KittiRaw(DataSetOnDisk):
     """KITTI raw.
 
     Args:
@@ -118,57 +115,55 @@ class KittiRaw(DataSet):
     """
 
     title = "KITTI raw"
+    digits = 2
+    source = "https://www.cvlibs.net/datasets/kitti/raw_data.php ([synced+rectified data] and [calibration] of a drive)"
+    marker = "folder of a date with drives, like 2011_09_26"
 
     def __init__(
         self,
         root: str | Path,
         projection: SphericalProjection,
-        train_sequences: Iterable[str | int],
-        val_sequences: Iterable[str | int],
-        test_sequences: Iterable[str | int],
+        train_sequences: Names,
+        val_sequences: Names,
+        test_sequences: Names,
         max_frames: int | None = None,
         deskew: bool = True,
         beam_correction_deg: float | int = 0.205,
     ) -> None:
-        self.root = Path(root)
-        self.projection = projection
-        self.train_sequences = sequence_names(train_sequences, digits=2)
-        self.val_sequences = sequence_names(val_sequences, digits=2)
-        self.test_sequences = sequence_names(test_sequences, digits=2)
-        self.max_frames = max_frames
-        self.deskew = deskew
-        self.beam_correction_deg = float(beam_correction_deg)
+        super().__init__(
+            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
+        )
 
     def sequence(self, name: str) -> KittiRawSequence:
         """Open a drive, or the part of one that is a sequence of KITTI odometry."""
         folder = self._folder(name)
         scans = self._scans(name).first(self.max_frames)
         if not len(scans):
-            raise self._not_found(folder / "velodyne_points" / "data" / "*.bin")
+            raise self._lacking(name, folder / "velodyne_points" / "data" / "*.bin")
         warn_of_gaps(name, scans)
-        timestamps = self._timestamps(folder, scans)
+        timestamps = self._timestamps(name, scans)
         return KittiRawSequence(
             name=name,
             scans=scans,
-            T_world_lidar=self._ground_truth(folder, timestamps),
+            T_world_lidar=self._ground_truth(name, timestamps),
             timestamps=timestamps,
             beam_correction_deg=self.beam_correction_deg,
         )
 
-    def check(self) -> LayoutReport:
-        """Describe this copy by names, sizes and the lengths of text files."""
-        report = LayoutReport()
-        if layout.describe_root(report, self.root, _is_root, "folder of a date with drives, like 2011_09_26", _SOURCE):
-            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
-            for name in configured:
-                self._check_sequence(report, name)
-            drives = [drive.name.removesuffix("_sync") for date in subfolders(self.root) for drive in _drives(date)]
-            there = {name: self._scans(name) for name in drives}
-            layout.describe_unconfigured(report, there, [_drive(name).name for name in configured])
-            layout.suggest_sequences(report, there)
-        return report
+    @staticmethod
+    def is_root(path: Path) -> bool:
+        """Whether it holds dates with drives."""
+        return any(_drives(date) for date in subfolders(path))
 
-    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+    def found(self) -> dict[str, ScanFiles]:
+        """All drives, those of KITTI odometry under the number by which they are configured."""
+        configured = {_drive(name).name: name for name in self.names}
+        drives = [drive.name.removesuffix("_sync") for date in subfolders(self.root) for drive in _drives(date)]
+        names = [configured.get(drive, drive) for drive in drives]
+        return {name: self._scans(name) for name in names}
+
+    def check_sequence(self, report: LayoutReport, name: str) -> None:
+        """Scans, their times, GPS/IMU packets and their calibration."""
         folder = self._folder(name)
         if not folder.is_dir():
             report.missing(name, f"no folder {folder.relative_to(self.root)}")
@@ -181,7 +176,7 @@ class KittiRaw(DataSet):
             layout.describe_rows(report, name, stamps, f"{end} times", rows_needed, needed=True)
         ground_truth_needed = name in self.test_sequences
         note = report.missing if ground_truth_needed else report.odd
-        packets = len(list_scans(folder / "oxts" / "data", (".txt",)))
+        packets = len(_packets(folder))
         if not packets:
             note(name, f"no ground truth: no files in {folder / 'oxts' / 'data'}")
             return
@@ -195,25 +190,26 @@ class KittiRaw(DataSet):
 
     def _scans(self, name: str) -> ScanFiles:
         drive = _drive(name)
-        scans = list_scans(self._folder(name) / "velodyne_points" / "data", (".bin",))
+        scans = list_scans(self._folder(name) / "velodyne_points" / "data", (".bin",), r"\d{10}")
         last = math.inf if drive.last is None else drive.last
         return scans.select(i for i, number in enumerate(scans.numbers) if drive.first <= number <= last)
 
-    def _timestamps(self, folder: Path, scans: ScanFiles) -> Float[Tensor, "n"]:
-        paths = [folder / "velodyne_points" / f"timestamps_{end}.txt" for end in ("start", "end")]
+    def _timestamps(self, name: str, scans: ScanFiles) -> Float[Tensor, "n"]:
+        paths = [self._folder(name) / "velodyne_points" / f"timestamps_{end}.txt" for end in ("start", "end")]
         for path in paths:
             if not path.is_file():
-                raise self._not_found(path)
+                raise self._lacking(name, path)
         start, end = (read_timestamps(path, scans.numbers) for path in paths)
         return (start + end) / 2
 
-    def _ground_truth(self, folder: Path, timestamps: Float[Tensor, "n"]) -> Float[Tensor, "n 4 4"] | None:
-        packets = list_scans(folder / "oxts" / "data", (".txt",))
+    def _ground_truth(self, name: str, timestamps: Float[Tensor, "n"]) -> Float[Tensor, "n 4 4"] | None:
+        folder = self._folder(name)
+        packets = _packets(folder)
         if not len(packets):
             return None
         for path in (folder / "oxts" / "timestamps.txt", folder.parent / "calib_imu_to_velo.txt"):
             if not path.is_file():
-                raise self._not_found(path)
+                raise self._lacking(name, path)
         times = read_timestamps(folder / "oxts" / "timestamps.txt", packets.numbers)
         if len(times) < 2 or (times.diff() <= 0).any():
             raise DamagedFileError(
@@ -230,8 +226,8 @@ class KittiRaw(DataSet):
         T_world_lidar = T_world_imu @ torch.linalg.inv(T_lidar_imu)
         return start_at_identity(interpolate_poses(times[used], T_world_lidar, timestamps))
 
-    def _not_found(self, path: Path) -> DataSetNotFoundError:
-        return layout.not_found(self.title, str(path.relative_to(self.root)), self.root, _is_root, _SOURCE)
+    def _lacking(self, name: str, path: Path) -> DataSetNotFoundError:
+        return self.not_found(name, str(path.relative_to(self.root)))
 
 
 def sweep_times(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -247,5 +243,5 @@ def _drives(date: Path) -> list[Path]:
     return [folder for folder in subfolders(date) if folder.name.startswith(f"{date.name}_drive_")]
 
 
-def _is_root(path: Path) -> bool:
-    return any(_drives(date) for date in subfolders(path))
+def _packets(folder: Path) -> ScanFiles:
+    return list_scans(folder / "oxts" / "data", (".txt",), r"\d{10}")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarlearn.data.errors import DataSetNotFoundError
+from lidarlearn.data.errors import ROOT_REMEDY
 from lidarlearn.data.scan_files import ScanFiles, gaps, subfolders
 from lidarlearn.data.sequence import LayoutReport
 from lidarlearn.errors import UserError
@@ -49,9 +49,7 @@ def describe_root(report: LayoutReport, root: Path, is_root: Callable[[Path], bo
         report.remedy = f"data.root={near}"
     else:
         report.missing("root", f"{root} holds no {marker}" if root.is_dir() else f"{root}: no such folder")
-        report.remedy = (
-            f"data.root=/path/to/your/copy, or the environment variable LIDARLEARN_DATA; get the data from {source}"
-        )
+        report.remedy = f"{ROOT_REMEDY}; get the data from {source}"
     return False
 
 
@@ -77,6 +75,9 @@ def describe_scans(
         report.missing(name, f"no scans in {scans.folder}")
         return
     report.found(name, f"{len(scans)} scans, {scans.names[0]} to {scans.names[-1]}")
+    if scans.others:
+        shown = ", ".join(map(repr, scans.others[:_SHOWN])) + (", ..." if len(scans.others) > _SHOWN else "")
+        report.odd(name, f"{len(scans.others)} files that are not named like scans are left out: {shown}")
     sizes = np.array(scans.sizes)
     broken = (sizes < smallest_bytes) | (sizes % (bytes_per_point or 1) != 0)
     if broken.any():
@@ -118,23 +119,6 @@ def count_rows(path: Path) -> int:
     """Number of lines of a text file, blank ones at the end left out: blank ones within stand for dropped frames."""
     with path.open("rb") as file:
         return max((number for number, line in enumerate(file, start=1) if line.strip()), default=0)
-
-
-def not_found(
-    title: str, missing: str, root: Path, is_root: Callable[[Path], bool], source: str
-) -> DataSetNotFoundError:
-    """The error for what is not there, with the right root where one lies near the configured one.
-
-    Args:
-        title: of the data set.
-        missing: what was not found.
-        root: as configured.
-        is_root: recognises the right level.
-        source: where the data comes from.
-    """
-    near = None if is_root(root) else find_root(root, is_root)
-    hint = "" if near is None else f"wrong folder level, data.root={near} looks right; "
-    return DataSetNotFoundError(title, hint + missing, root, source)
 
 
 def refuse_deskew(title: str, deskew: bool) -> None:

@@ -10,7 +10,6 @@ as a spherical projection needs: there, and only there, every beam has the const
 Ground truth is the Segway's pose at about 100 Hz: utime, x, y, z, roll, pitch, heading; rows with NaN stand for no fix.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,14 +21,14 @@ from torch import Tensor
 
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
+from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, start_at_identity
-from lidarlearn.data.scan_files import ScanFiles, list_scans, read_bytes, sequence_names, subfolders
-from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.data.scan_files import ScanFiles, list_scans, read_bytes, subfolders
+from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 
-_SOURCE = "http://robots.engin.umich.edu/nclt/ (velodyne and ground truth of each date)"
 POINT = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
 SCALE_M = 0.005
 OFFSET_M = -100.0
@@ -76,7 +75,7 @@ class NcltSequence(Sequence):
         )
 
 
-class Nclt(DataSet):
+class Nclt(DataSetOnDisk):
     """NCLT.
 
     Args:
@@ -92,35 +91,32 @@ class Nclt(DataSet):
     """
 
     title = "NCLT"
+    source = "http://robots.engin.umich.edu/nclt/ (velodyne and ground truth of each date)"
+    marker = "folder of a date with velodyne_sync in it"
 
     def __init__(
         self,
         root: str | Path,
         projection: SphericalProjection,
-        train_sequences: Iterable[str | int],
-        val_sequences: Iterable[str | int],
-        test_sequences: Iterable[str | int],
+        train_sequences: Names,
+        val_sequences: Names,
+        test_sequences: Names,
         max_frames: int | None = None,
         deskew: bool = False,
         beam_correction_deg: float | int = 0.0,
         sensor_height_m: float | int = 1.03,
     ) -> None:
-        self.root = Path(root)
-        self.projection = projection
-        self.train_sequences = sequence_names(train_sequences)
-        self.val_sequences = sequence_names(val_sequences)
-        self.test_sequences = sequence_names(test_sequences)
-        self.max_frames = max_frames
-        self.deskew = deskew
-        self.beam_correction_deg = float(beam_correction_deg)
+        super().__init__(
+            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
+        )
         self.sensor_height_m = float(sensor_height_m)
 
     def sequence(self, name: str) -> NcltSequence:
         """Open a drive; scans before and after its ground truth are left out."""
         layout.refuse_deskew(self.title, self.deskew)
-        scans = list_scans(self.root / name / "velodyne_sync", (".bin",))
+        scans = self._scans(name)
         if not len(scans):
-            raise self._not_found(f"{name}/velodyne_sync/*.bin")
+            raise self.not_found(name, f"{name}/velodyne_sync/*.bin")
         ground_truth = self._ground_truth_file(name)
         truth = None if ground_truth is None else read_ground_truth(ground_truth)
         if truth is not None:
@@ -138,24 +134,21 @@ class Nclt(DataSet):
             sensor_height_m=self.sensor_height_m,
         )
 
-    def check(self) -> LayoutReport:
-        """Describe this copy by names and sizes."""
-        report = LayoutReport()
-        if layout.describe_root(report, self.root, _is_root, "folder of a date with velodyne_sync in it", _SOURCE):
-            days = [folder for folder in subfolders(self.root) if (folder / "velodyne_sync").is_dir()]
-            there = {folder.name: list_scans(folder / "velodyne_sync", (".bin",)) for folder in days}
-            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
-            for name in configured:
-                self._check_sequence(report, name)
-            layout.describe_unconfigured(report, there, configured)
-            layout.suggest_sequences(report, there)
-        return report
+    @staticmethod
+    def is_root(path: Path) -> bool:
+        """Whether it holds dates with scans."""
+        return any((date / "velodyne_sync").is_dir() for date in subfolders(path))
 
-    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+    def found(self) -> dict[str, ScanFiles]:
+        """All dates."""
+        return {folder.name: self._scans(folder.name) for folder in subfolders(self.root)}
+
+    def check_sequence(self, report: LayoutReport, name: str) -> None:
+        """Scans and ground truth."""
         if not (self.root / name).is_dir():
             report.missing(name, f"no folder {name}")
             return
-        scans = list_scans(self.root / name / "velodyne_sync", (".bin",))
+        scans = self._scans(name)
         layout.describe_scans(report, name, scans, POINT.itemsize, numbered=False)
         note = report.missing if name in self.test_sequences else report.odd
         ground_truth = self._ground_truth_file(name)
@@ -166,6 +159,9 @@ class Nclt(DataSet):
         else:
             report.found(name, f"ground truth in {ground_truth.relative_to(self.root)}")
 
+    def _scans(self, name: str) -> ScanFiles:
+        return list_scans(self.root / name / "velodyne_sync", (".bin",), r"\d+")
+
     def _ground_truth_file(self, name: str) -> Path | None:
         candidates = (folder / f"groundtruth_{name}.csv" for folder in (self.root / name, self.root / "ground_truth"))
         return next((path for path in candidates if path.is_file()), None)
@@ -175,9 +171,6 @@ class Nclt(DataSet):
         T_files_lidar[2, 3] = -self.sensor_height_m
         T_world_files = interpolate_poses(truth.timestamps, truth.T_world_body, timestamps)
         return start_at_identity(T_world_files @ T_files_lidar)
-
-    def _not_found(self, missing: str) -> DataSetNotFoundError:
-        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
 
 
 def read_ground_truth(path: Path) -> StampedPoses:
@@ -199,7 +192,3 @@ def read_ground_truth(path: Path) -> StampedPoses:
 
 def _timestamps(scans: ScanFiles) -> Float[Tensor, "n"]:
     return torch.tensor(scans.numbers, dtype=torch.float64) * 1e-6
-
-
-def _is_root(path: Path) -> bool:
-    return any((date / "velodyne_sync").is_dir() for date in subfolders(path))

@@ -6,8 +6,6 @@ point's place in the file gives its time. Poses (`sec,nsec,x,y,z,qx,qy,qz,qw`) a
 10 Hz, from registration to a survey-grade map; we interpolate them at the middle of each sweep.
 """
 
-import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,14 +18,14 @@ from torch import Tensor
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.cloud_files import read_cloud
-from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
+from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, stamped_poses, start_at_identity
-from lidarlearn.data.scan_files import ScanFiles, list_scans, sequence_names, subfolders
-from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.data.scan_files import ScanFiles, list_scans, subfolders
+from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 
-_SOURCE = "https://ori-drs.github.io/newer-college-dataset/ (2020 release: ouster_scan and ground_truth of a sequence)"
 BEAMS, COLUMNS = 64, 1024
 PERIOD_S = 0.1
 
@@ -75,7 +73,7 @@ class NewerCollegeSequence(Sequence):
         return self.scans.fingerprint("NewerCollege", beam_correction_deg=self.beam_correction_deg)
 
 
-class NewerCollege(DataSet):
+class NewerCollege(DataSetOnDisk):
     """Newer College (2020).
 
     Args:
@@ -90,32 +88,29 @@ class NewerCollege(DataSet):
     """
 
     title = "Newer College"
+    source = "https://ori-drs.github.io/newer-college-dataset/ (2020 release: ouster_scan and ground_truth of a walk)"
+    marker = "folder like 01_short_experiment with raw_format/ouster_scan in it"
 
     def __init__(
         self,
         root: str | Path,
         projection: SphericalProjection,
-        train_sequences: Iterable[str | int],
-        val_sequences: Iterable[str | int],
-        test_sequences: Iterable[str | int],
+        train_sequences: Names,
+        val_sequences: Names,
+        test_sequences: Names,
         max_frames: int | None = None,
         deskew: bool = True,
         beam_correction_deg: float | int = 0.0,
     ) -> None:
-        self.root = Path(root)
-        self.projection = projection
-        self.train_sequences = sequence_names(train_sequences)
-        self.val_sequences = sequence_names(val_sequences)
-        self.test_sequences = sequence_names(test_sequences)
-        self.max_frames = max_frames
-        self.deskew = deskew
-        self.beam_correction_deg = float(beam_correction_deg)
+        super().__init__(
+            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
+        )
 
     def sequence(self, name: str) -> NewerCollegeSequence:
         """Open a walk; scans before and after its ground truth are left out."""
-        scans = list_scans(_scan_folder(self.root / name), (".pcd",))
+        scans = _scans(self.root / name)
         if not len(scans):
-            raise self._not_found(f"{name}/raw_format/ouster_scan/cloud_*.pcd")
+            raise self.not_found(name, f"{name}/raw_format/ouster_scan/cloud_*.pcd")
         truth_file = self._truth_file(name)
         truth = read_registered_poses(truth_file) if truth_file.is_file() else None
         if truth is not None:
@@ -136,29 +131,22 @@ class NewerCollege(DataSet):
             beam_correction_deg=self.beam_correction_deg,
         )
 
-    def check(self) -> LayoutReport:
-        """Describe this copy by names and sizes."""
-        report = LayoutReport()
-        marker = "folder like 01_short_experiment with raw_format/ouster_scan in it"
-        if layout.describe_root(report, self.root, _is_root, marker, _SOURCE):
-            walks = [folder for folder in subfolders(self.root) if _scan_folder(folder).is_dir()]
-            there = {folder.name: list_scans(_scan_folder(folder), (".pcd",)) for folder in walks}
-            configured = dict.fromkeys(self.train_sequences + self.val_sequences + self.test_sequences)
-            for name in configured:
-                self._check_sequence(report, name)
-            layout.describe_unconfigured(report, there, configured)
-            layout.suggest_sequences(report, there)
-        return report
+    @staticmethod
+    def is_root(path: Path) -> bool:
+        """Whether it holds walks with scans."""
+        return any(_scan_folder(folder).is_dir() for folder in subfolders(path))
 
-    def _check_sequence(self, report: LayoutReport, name: str) -> None:
+    def found(self) -> dict[str, ScanFiles]:
+        """All walks."""
+        return {folder.name: _scans(folder) for folder in subfolders(self.root)}
+
+    def check_sequence(self, report: LayoutReport, name: str) -> None:
+        """Scans and ground truth."""
         if not (self.root / name).is_dir():
             report.missing(name, f"no folder {name}")
             return
-        scans = list_scans(_scan_folder(self.root / name), (".pcd",))
+        scans = _scans(self.root / name)
         layout.describe_scans(report, name, scans, bytes_per_point=None, numbered=False)
-        unnamed = [file for file in scans.names if not _NAME.match(file)]
-        if unnamed:
-            report.missing(name, f"{len(unnamed)} files not named cloud_<s>_<ns>.pcd, the first is {unnamed[0]}")
         note = report.missing if name in self.test_sequences else report.odd
         truth = self._truth_file(name)
         if not truth.is_file():
@@ -170,9 +158,6 @@ class NewerCollege(DataSet):
 
     def _truth_file(self, name: str) -> Path:
         return self.root / name / "ground_truth" / "registered_poses.csv"
-
-    def _not_found(self, missing: str) -> DataSetNotFoundError:
-        return layout.not_found(self.title, missing, self.root, _is_root, _SOURCE)
 
 
 def read_registered_poses(path: Path) -> StampedPoses:
@@ -187,22 +172,16 @@ def read_registered_poses(path: Path) -> StampedPoses:
     return stamped_poses(path, np.column_stack([rows[:, 0] + 1e-9 * rows[:, 1], rows[:, 2:]]))
 
 
-_NAME = re.compile(r"cloud_(\d+)_(\d+)\.pcd$")
+def _scans(walk: Path) -> ScanFiles:
+    return list_scans(_scan_folder(walk), (".pcd",), r"cloud_\d+_\d+")
 
 
 def _middles(scans: ScanFiles) -> Float[Tensor, "n"]:
     """Time of the middle of each sweep [s], from the files' names."""
-    matches = [_NAME.match(name) for name in scans.names]
-    if None in matches:
-        path = scans.path(matches.index(None))
-        raise DamagedFileError(path, "not named cloud_<s>_<ns>.pcd, so its time is unknown", "rename or remove it")
-    starts = [int(match[1]) + 1e-9 * int(match[2]) for match in matches if match is not None]
+    stamps = [Path(name).stem.split("_")[1:] for name in scans.names]
+    starts = [int(seconds) + 1e-9 * int(nanoseconds) for seconds, nanoseconds in stamps]
     return torch.tensor(starts, dtype=torch.float64) + PERIOD_S / 2
 
 
 def _scan_folder(walk: Path) -> Path:
     return walk / "raw_format" / "ouster_scan"
-
-
-def _is_root(path: Path) -> bool:
-    return any(_scan_folder(folder).is_dir() for folder in subfolders(path))

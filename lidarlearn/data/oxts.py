@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.pose_files import as_transforms, read_numbers, require_finite
+from lidarlearn.data.pose_files import as_transforms, read_lines, read_numbers, require_finite
 from lidarlearn.data.scan_files import ScanFiles
 
 EARTH_RADIUS_M = 6378137.0
@@ -55,7 +55,7 @@ def read_timestamps(path: Path, numbers: list[int]) -> Float[Tensor, "n"]:
     Raises:
         DamagedFileError: a line is missing, blank or not a date.
     """
-    lines = path.read_text().splitlines()
+    lines = read_lines(path)
     if numbers and max(numbers) >= len(lines):
         raise DamagedFileError(path, f"{len(lines)} rows, too few for frame {max(numbers)}")
     try:
@@ -74,7 +74,7 @@ def read_rigid_transform(path: Path) -> Float[Tensor, "4 4"]:
     Raises:
         DamagedFileError: not such a file.
     """
-    entries = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
+    entries = dict(line.split(":", 1) for line in read_lines(path) if ":" in line)
     try:
         R = torch.tensor([float(v) for v in entries["R"].split()], dtype=torch.float64).reshape(3, 3)
         t = torch.tensor([float(v) for v in entries["T"].split()], dtype=torch.float64).reshape(3, 1)

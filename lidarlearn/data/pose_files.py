@@ -26,17 +26,25 @@ class StampedPoses:
     T_world_body: Float[Tensor, "n 4 4"]
 
 
+def read_lines(path: Path) -> list[str]:
+    """The lines of a text file.
+
+    Raises:
+        DamagedFileError: absent, or no text.
+    """
+    try:
+        return path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DamagedFileError(path, f"cannot be read: {error}") from error
+
+
 def read_numbers(path: Path, columns: int, delimiter: str | None = None) -> NDArray[np.float64]:
     """A text file of rows of numbers, `#` begins a comment; NaN is left to the caller.
 
     Raises:
         DamagedFileError: absent, empty, not numbers, or another number of columns.
     """
-    try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DamagedFileError(path, f"cannot be read: {error}") from error
-    lines = [line for line in text.splitlines() if line.split("#")[0].strip()]
+    lines = [line for line in read_lines(path) if line.split("#")[0].strip()]
     if not lines:
         raise DamagedFileError(path, "the file is empty")
     try:

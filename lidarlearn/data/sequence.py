@@ -1,17 +1,26 @@
 """The two interfaces behind which every data set stands: a `Sequence` of scans and the `DataSet` it belongs to."""
 
+import logging
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarlearn.data.errors import require_count
+from lidarlearn.data.field_of_view import misfit
+from lidarlearn.data.scan_files import sequence_names
 from lidarlearn.geometry.projection import SphericalProjection
 
+_log = logging.getLogger(__name__)
+
 Level = Literal["found", "odd", "missing"]
+Names = Iterable[str | int] | str | int
 
 
 @dataclass(frozen=True)
@@ -67,7 +76,10 @@ class Sequence(ABC):
     @property
     @abstractmethod
     def fingerprint(self) -> str:
-        """Changes whenever a scan would come out differently: settings of the reader, files and their sizes."""
+        """Changes whenever a scan would come out differently: settings of the reader, and the files.
+
+        What the code makes of them is not its concern, see `source_digest`.
+        """
 
     def __iter__(self) -> Iterator[Scan]:
         return (self.scan(i) for i in range(len(self)))
@@ -113,28 +125,72 @@ class LayoutReport:
 class DataSet(ABC):
     """A data set on disk: opens sequences by name and says which serve for training, validation and test.
 
-    Every data set's constructor takes the attributes below under the same names, so that a setting means the same in
+    Every data set's constructor takes the arguments below under the same names, so that a setting means the same in
     each of them; `configs/data/<name>.yaml` holds their values.
 
     Attributes:
         title: the data set, as its authors call it.
+        digits: to which names that arrive as numbers are filled up.
+
+    Args:
+        root: where it lies; `~` is the home folder.
         projection: the image of its sensor.
-        train_sequences: names of the sequences to train on.
+        train_sequences: names of the sequences to train on; a single name will do.
         val_sequences: names of the sequences by which the best checkpoint is chosen.
         test_sequences: names of the sequences that an evaluation runs.
         max_frames: keep only the first scans of each sequence; None keeps all.
         deskew: whether odometries compensate the motion within a scan; only where scans carry times.
         beam_correction_deg: angle by which each point is rotated to correct the intrinsic calibration [deg].
+
+    Raises:
+        UserError: `max_frames` is no number of scans.
     """
 
     title: str
-    projection: SphericalProjection
-    train_sequences: tuple[str, ...]
-    val_sequences: tuple[str, ...]
-    test_sequences: tuple[str, ...]
-    max_frames: int | None
-    deskew: bool
-    beam_correction_deg: float
+    digits: int = 0
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        projection: SphericalProjection,
+        train_sequences: Names,
+        val_sequences: Names,
+        test_sequences: Names,
+        max_frames: int | None,
+        deskew: bool,
+        beam_correction_deg: float | int,
+    ) -> None:
+        require_count("data.max_frames", max_frames)
+        self.root = Path(root).expanduser()
+        self.projection = projection
+        self.train_sequences = sequence_names(train_sequences, self.digits)
+        self.val_sequences = sequence_names(val_sequences, self.digits)
+        self.test_sequences = sequence_names(test_sequences, self.digits)
+        self.max_frames = max_frames
+        self.deskew = deskew
+        self.beam_correction_deg = float(beam_correction_deg)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All configured sequences, each once."""
+        return tuple(dict.fromkeys((*self.train_sequences, *self.val_sequences, *self.test_sequences)))
+
+    def settings_naming(self, name: str) -> str:
+        """The settings in which a sequence is named, for error messages."""
+        settings = ("train_sequences", "val_sequences", "test_sequences")
+        return ", ".join(f"data.{s}" for s in settings if name in getattr(self, s)) or "the name"
+
+    def sequences(self, names: Iterable[str]) -> dict[str, Sequence]:
+        """Open several sequences, all of them before work on the first begins; warns where a scan misses the image.
+
+        Raises:
+            DataSetNotFoundError, DamagedFileError: see `sequence`; or the first scan of one cannot be read.
+        """
+        opened = {name: self.sequence(name) for name in names}
+        remarks = (misfit(name, sequence.scan(0).points, self.projection) for name, sequence in opened.items())
+        if remark := next(filter(None, remarks), None):
+            _log.warning(remark)
+        return opened
 
     @abstractmethod
     def sequence(self, name: str) -> Sequence:
@@ -147,7 +203,7 @@ class DataSet(ABC):
 
     @abstractmethod
     def check(self) -> LayoutReport:
-        """Describe this copy without reading whole scans: found, missing, odd."""
+        """Describe this copy: found, missing, odd. Of each sequence the first scan is read at most."""
 
     def prepare(self, names: Iterable[str] | None = None) -> None:  # noqa: B027 - most data sets have nothing to do
         """Make what can be made on the spot (simulated scans); called once, before any sequence is opened.

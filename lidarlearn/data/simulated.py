@@ -7,18 +7,19 @@ import re
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from filelock import FileLock
-from rich.progress import Progress
 
-from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError, one_line, require_count
+from lidarlearn.data.progress import progress
+from lidarlearn.data.sequence import DataSet, LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.writable import writable
+from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.simulation.drive import Drive
+from lidarlearn.simulation.drive import Drive, simulator_digest
 from lidarlearn.simulation.sensors import Sensor
 from lidarlearn.simulation.trajectories import read_poses
 from lidarlearn.simulation.worlds import PRESETS
@@ -76,6 +77,10 @@ class SimulatedDataSet(DataSet):
     A sequence is called `<world>_<number>`, e.g. urban_00; worlds are urban, highway, campus and segway. Each number
     has a place and a way of its own: different numbers for training, validation and test are different places.
 
+    The range images lie in `root/simulator_<digest of its code>/<name>_<digest of the settings>`, 131 kB for each scan
+    of 64 beams. A changed simulator makes every drive anew; what earlier ones made lies in the folders beside its own
+    and may be deleted.
+
     Args:
         root: folder of the range images; any two settings can share it.
         projection: the image of the sensor.
@@ -91,7 +96,7 @@ class SimulatedDataSet(DataSet):
         pose_file: path to drive, in KITTI's format, one pose per scan; None makes one for each sequence.
         pose_file_frame: "camera" for poses of KITTI's left camera, "lidar" for the sensor's own.
         max_frames: keep only the first scans of each sequence, and make no more; None keeps all.
-        deskew: whether odometries compensate the motion within a scan.
+        deskew: whether odometries compensate the motion within a scan; only with `motion_distortion`.
         beam_correction_deg: there is nothing to correct in simulated scans: must be 0.
         workers: threads that make scans; None for one per processor, at most 8. Their number changes nothing else.
     """
@@ -103,9 +108,9 @@ class SimulatedDataSet(DataSet):
         root: str | os.PathLike[str],
         projection: SphericalProjection,
         sensor: Sensor | None = None,
-        train_sequences: Iterable[str] = (),
-        val_sequences: Iterable[str] = (),
-        test_sequences: Iterable[str] = (),
+        train_sequences: Names = (),
+        val_sequences: Names = (),
+        test_sequences: Names = (),
         frames: int = 200,
         seed: int = 0,
         speed: float | None = None,
@@ -118,23 +123,31 @@ class SimulatedDataSet(DataSet):
         beam_correction_deg: float = 0.0,
         workers: int | None = None,
     ) -> None:
+        super().__init__(
+            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
+        )
         if beam_correction_deg != 0:
-            raise ValueError(
-                f"simulated beams need no correction: beam_correction_deg must be 0, got {beam_correction_deg}"
+            raise UserError(
+                f"data.beam_correction_deg={beam_correction_deg}: simulated beams are as they should be.\n"
+                "  change: data.beam_correction_deg=0"
             )
-        self.root, self.projection, self.sensor = Path(root), projection, sensor
-        self.train_sequences, self.val_sequences = tuple(train_sequences), tuple(val_sequences)
-        self.test_sequences = tuple(test_sequences)
+        if deskew and not motion_distortion:
+            raise UserError(
+                "data.deskew=true: these scans are not distorted by motion.\n"
+                "  change: data.deskew=false, or data.motion_distortion=true"
+            )
+        require_count("data.frames", frames)
+        self.sensor = sensor
         self.frames, self.seed, self.speed, self.static = frames, seed, speed, static
         self.motion_distortion, self.pose_file, self.pose_file_frame = motion_distortion, pose_file, pose_file_frame
-        self.max_frames, self.deskew, self.beam_correction_deg = max_frames, deskew, beam_correction_deg
         self.workers = min(os.cpu_count() or 1, 8) if workers is None else workers
 
     def sequence(self, name: str) -> SimulatedSequence:
         """Open a sequence.
 
         Raises:
-            DataSetNotFoundError: it was not made yet, or its name is not that of a simulated drive.
+            DataSetNotFoundError: it was not made yet.
+            UserError: its name is not that of a simulated drive.
         """
         drive = self._drive(name)
         folder, frames = self.folder(drive), self._wanted(drive)
@@ -146,11 +159,11 @@ class SimulatedDataSet(DataSet):
     def check(self) -> LayoutReport:
         """Which sequences were made already; those that were not can be made at any time."""
         report = LayoutReport()
-        for name in self._names():
+        for name in self.names:
             try:
                 drive = self._drive(name)
-            except DataSetNotFoundError as problem:
-                report.missing(name, str(problem))
+            except UserError as problem:
+                report.missing(name, one_line(problem))
                 continue
             frames = self._wanted(drive)
             made = frames - len(_missing(self.folder(drive), range(frames)))
@@ -159,11 +172,11 @@ class SimulatedDataSet(DataSet):
         return report
 
     def prepare(self, names: Iterable[str] | None = None) -> None:
-        """Make the scans that are missing, with a progress bar; safe when two processes do it, or one is killed."""
-        drives = [self._drive(name) for name in (self._names() if names is None else dict.fromkeys(names))]
+        """Make the scans that are missing and show the progress; safe when two processes do it, or one is killed."""
+        drives = [self._drive(name) for name in (self.names if names is None else dict.fromkeys(names))]
         if not any(_missing(self.folder(drive), range(self._wanted(drive))) for drive in drives):
             return
-        self.root.mkdir(parents=True, exist_ok=True)
+        writable(self.root, "data.root=/path/with/room, or the environment variable LIDARLEARN_DATA")
         with FileLock(self.root / "simulation.lock"):
             missing = [(d, self.folder(d), _missing(self.folder(d), range(self._wanted(d)))) for d in drives]
             jobs = [job for job in missing if job[2]]
@@ -173,11 +186,8 @@ class SimulatedDataSet(DataSet):
                 _make(jobs, self.workers)
 
     def folder(self, drive: Drive) -> Path:
-        """Where the range images of a drive lie."""
-        return self.root / f"{drive.name}_{drive.fingerprint}"
-
-    def _names(self) -> list[str]:
-        return list(dict.fromkeys((*self.train_sequences, *self.val_sequences, *self.test_sequences)))
+        """Where the range images of a drive lie: with all that the same code of the simulator made."""
+        return self.root / f"simulator_{simulator_digest()}" / f"{drive.name}_{drive.fingerprint}"
 
     def _wanted(self, drive: Drive) -> int:
         return len(drive) if self.max_frames is None else min(len(drive), self.max_frames)
@@ -185,8 +195,10 @@ class SimulatedDataSet(DataSet):
     def _drive(self, name: str) -> Drive:
         match = re.fullmatch(r"([a-z]+)_(\d+)", name)
         if match is None or match[1] not in PRESETS:
-            problem = f"sequence {name!r} (they are called {'_00, '.join(PRESETS)}_00, ...)"
-            raise DataSetNotFoundError(self.title, problem, self.root, _SOURCE, "data.train_sequences")
+            raise UserError(
+                f"there is no simulated sequence {name!r}.\n"
+                f"  change: {self.settings_naming(name)} to names like {', '.join(f'{world}_07' for world in PRESETS)}"
+            )
         poses = None if self.pose_file is None else read_poses(Path(self.pose_file), self.pose_file_frame == "camera")
         return Drive(
             match[1],
@@ -230,9 +242,9 @@ def _make(jobs: list[_Job], workers: int) -> None:
     total = sum(len(indices) for _, _, indices in jobs)
     stop = threading.Event()
     # Threads do, and need no importable main module: ray casting and numpy's loops run without the interpreter's lock.
-    with Progress(transient=True) as progress, ThreadPoolExecutor(max(1, workers)) as pool:
-        bar = progress.add_task("Simulating drives", total=total)
-        running = {pool.submit(_work, portion, stop, partial(progress.advance, bar)) for portion in portions}
+    what = f"simulating {len(jobs)} drive{'s' if len(jobs) > 1 else ''}"
+    with progress(what, total) as advance, ThreadPoolExecutor(max(1, workers)) as pool:
+        running = {pool.submit(_work, portion, stop, advance) for portion in portions}
         try:
             for future in as_completed(running):
                 future.result()

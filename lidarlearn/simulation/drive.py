@@ -3,6 +3,7 @@
 import hashlib
 from dataclasses import asdict
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,9 +17,9 @@ from lidarlearn.simulation.sensors import Sensor
 from lidarlearn.simulation.terrain import GroundBelow, Hills, Terrain
 from lidarlearn.simulation.trajectories import Trajectory, extended, on_ground
 from lidarlearn.simulation.worlds import World, build_world, preset
+from lidarlearn.source_digest import source_digest
 
-# Part of every fingerprint: to be raised whenever the same settings come to give other scans.
-GENERATOR = 2
+_SIMULATOR = Path(__file__).resolve().parent
 
 # Each source of chance has a stream of its own, so that e.g. a static drive takes the way of the lively one.
 _TERRAIN, _MOTION, _WORLD, _SCAN = range(4)
@@ -74,8 +75,8 @@ class Drive(Sequence):
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the settings."""
-        settings = [GENERATOR, self.world_name, self.seed, self.frames, sorted(asdict(self.sensor).items())]
+        """Hash of the settings and of the simulator's code: changed, it may give other scans for the same settings."""
+        settings = [simulator_digest(), self.world_name, self.seed, self.frames, sorted(asdict(self.sensor).items())]
         settings += [self.speed, self.static, self.motion_distortion]
         digest = hashlib.sha256(repr(settings).encode())
         if self._given is not None:
@@ -171,6 +172,11 @@ class Drive(Sequence):
                 nearer = found < distances[:, columns]
                 distances[:, columns] = np.where(nearer, found, distances[:, columns])
                 cosines[:, columns] = np.where(nearer, cosine, cosines[:, columns])
+
+
+def simulator_digest() -> str:
+    """Hash of the code that scans depend on: this module and those of the simulator that it uses."""
+    return source_digest(Path(__file__), within=_SIMULATOR)
 
 
 def _seen(vertices: np.ndarray, pose: np.ndarray, azimuths: np.ndarray) -> np.ndarray:

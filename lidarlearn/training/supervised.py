@@ -17,6 +17,8 @@ class SupervisedModule(PoseNetModule):
     Source: Dellenbach et al. 2021, III-B "Supervised training".
     """
 
+    needs_ground_truth = True  # which the datamodule sees to before it begins
+
     def compute_loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
         """Distance to ground truth.
 

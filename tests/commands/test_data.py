@@ -86,6 +86,30 @@ def test_a_whole_copy_is_usable_and_a_partial_one_is_described(tmp_path, capsys,
     assert f"({sequence})" in printed  # what there is instead
 
 
+@pytest.mark.parametrize("name", data_groups())
+@pytest.mark.parametrize("count", ["0", "-1"])
+def test_no_data_set_takes_no_scans_for_a_number_of_scans(capsys, name, count):
+    code, printed = run(capsys, "check", f"data={name}", f"data.max_frames={count}")
+    assert code == 1 and f"data.max_frames={count}" in printed and "at least 1" in printed
+
+
+def test_a_simulated_drive_needs_a_scan(capsys):
+    code, printed = run(capsys, "check", "data=simulated_urban", "data.frames=0")
+    assert code == 1 and "data.frames" in printed and "at least 1" in printed
+
+
+@pytest.mark.parametrize("name", data_groups())
+def test_one_sequence_needs_no_brackets_and_a_root_may_begin_at_home(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    data = compose_data_set([f"data={name}", "data.test_sequences=urban_07", "data.root='~/scans'"])
+    assert data.test_sequences == ("urban_07",) and data.root == tmp_path / "scans"
+
+
+def test_a_simulated_name_that_is_none_is_found_by_the_check(capsys):
+    code, printed = run(capsys, "check", "data=simulated_urban", "data.test_sequences=[town_1]")
+    assert code == 1 and "no simulated sequence 'town_1'" in printed and "data.test_sequences to names" in printed
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [

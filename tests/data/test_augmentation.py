@@ -79,6 +79,16 @@ def test_a_turned_sensor_moves_in_another_direction_by_the_same_distance(pair):
     assert se3.rotation_angle(quarter["T_ref_new"]) == pytest.approx(se3.rotation_angle(pair["T_ref_new"]))
 
 
+def test_points_turned_beyond_what_16_bits_hold_are_lost_rather_than_elsewhere():
+    vertex_map = torch.zeros(3, 1, 8)
+    vertex_map[:, 0, 0] = torch.tensor([120.0, 100.0, 0.0])  # 156 m away
+    vertex_map[:, 0, 4] = torch.tensor([-20.0, 10.0, 1.0])
+    far = Pair(reference=encode(vertex_map), target=encode(vertex_map), index=0)
+    turned_map = decode(turned(far, 1)["reference"])  # by 45 deg
+    assert activated(turned_map).nonzero().tolist() == [[0, 5]]
+    assert turned_map[:, 0, 5].tolist() == pytest.approx([-7.071, 21.213, 1.0], abs=0.003)
+
+
 @pytest.mark.parametrize("change", ["mirrored", "turned", "reversed"])
 def test_undone_it_is_no_change(change, pair):
     undo = {

@@ -83,19 +83,34 @@ def test_an_interrupted_cache_is_completed_and_what_was_done_is_kept(tmp_path, m
 
 
 @pytest.mark.parametrize("file", ["vertex_maps.npy", "done.npy"])
-@pytest.mark.parametrize("left", [None, 0, 40])
-def test_a_lost_or_truncated_file_is_made_again(tmp_path, file, left):
+@pytest.mark.parametrize("left", [None, 0, 40, 0.5, 0.99])
+@pytest.mark.parametrize("complete", [True, False])
+def test_a_lost_or_truncated_file_is_made_again(tmp_path, file, left, complete):
     cached_vertex_maps(CountingSequence(), SMALL, tmp_path)
     path = next(tmp_path.rglob(file))
+    if not complete:  # one frame is still to be projected
+        done = np.lib.format.open_memmap(path.with_name("done.npy"), mode="r+")
+        done[5] = False
+        done.flush()
     if left is None:
         path.unlink()
     else:
-        path.write_bytes(path.read_bytes()[:left])
-        if file == "vertex_maps.npy":
-            path.with_name("done.npy").unlink()
+        whole = path.read_bytes()
+        path.write_bytes(whole[: left if isinstance(left, int) else int(left * len(whole))])
     again = CountingSequence()
     maps = cached_vertex_maps(again, SMALL, tmp_path)
-    torch.testing.assert_close(maps[6], encode(SMALL.vertex_map(again.scan(6).points)))
+    assert again.read == list(range(7))
+    for i in range(7):
+        torch.testing.assert_close(maps[i], encode(SMALL.vertex_map(again.scan(i).points)))
+
+
+def test_a_changed_reader_makes_another_cache(tmp_path, monkeypatch):
+    first = cached_vertex_maps(CountingSequence(), SMALL, tmp_path)
+    digests = []
+    monkeypatch.setattr(cache, "source_digest", lambda *files: digests.append(files) or "of other code")
+    again = CountingSequence()
+    assert cached_vertex_maps(again, SMALL, tmp_path).file != first.file and again.read == list(range(7))
+    assert digests[0] == (Path(__file__), Path(cache.__file__))
 
 
 @pytest.mark.filterwarnings(

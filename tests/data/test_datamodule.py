@@ -1,12 +1,17 @@
 """The datamodule: which pairs reach the network, and how."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
+from lidarlearn.commands.train import train
 from lidarlearn.data.datamodule import OdometryDataModule
+from lidarlearn.data.errors import DataSetNotFoundError
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
 from tests.box_world import SMALL, BoxDrives
+from tests.training.runs import configured
 
 
 def make(tmp_path, drives=None, **settings):
@@ -72,6 +77,28 @@ def test_workers_load_the_same(tmp_path):
     plain, loaded = make(tmp_path), make(tmp_path, num_workers=2)
     for a, b in zip(plain.val_dataloader()[0], loaded.val_dataloader()[0], strict=True):
         torch.testing.assert_close(a["reference"], b["reference"])
+
+
+class WithoutTheLast(BoxDrives):
+    """Its last sequence, for validation, is not there."""
+
+    def sequence(self, name):
+        if name == self.val_sequences[-1]:
+            raise DataSetNotFoundError("boxes", f"sequence {name}", Path("nowhere"), "a carpenter")
+        return super().sequence(name)
+
+
+def test_what_is_missing_is_told_before_anything_is_projected(tmp_path):
+    with pytest.raises(DataSetNotFoundError, match="sequence 2"):
+        make(tmp_path, WithoutTheLast(frames=9))
+    assert not list(tmp_path.rglob("*.npy"))
+
+
+def test_missing_labels_are_told_before_anything_is_projected(tmp_path):
+    config = configured(tmp_path / "run", "loss=supervised", frames=9, without_truth=["1", "2"])
+    with pytest.raises(UserError, match=r"there is none of 1, 2"):
+        train(config, data_name="boxes")
+    assert not list((tmp_path / "cache").rglob("*.npy"))
 
 
 def test_nothing_to_train_on_is_an_error_that_names_the_setting(tmp_path):

@@ -1,18 +1,22 @@
 """Simulated drives written in each native format, read back by its reader, and driven by an odometry."""
 
+import shlex
+import subprocess
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
 
-from lidarlearn.commands.data import compose_data_set, main
-from lidarlearn.data.export.formats import export
+from lidarlearn.commands.data import compose_data_set, data_groups, main, matched_names
+from lidarlearn.data.export.formats import export, format_of
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl32_inverted, hdl64
+from tests.data.writers import random_points, write_float32
 from tests.odometry.odometries import build, motion_errors, poses
 
 FRAMES = 5
@@ -101,6 +105,101 @@ def test_a_folder_in_any_kind_of_file(suffix, tmp_path):
     assert (read.scan(1).times is not None) == (suffix in (".pcd", ".ply"))
 
 
+def write_folder(root, names=("a", "b"), scans=2):
+    for name in names:
+        for i in range(scans):
+            write_float32(root / name / f"{i}.bin", random_points(i))
+
+
+def contents(root):
+    return {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as exited:
+        main(["export", *arguments])
+    return exited.value.code
+
+
+def test_each_scan_is_written_once_and_the_printed_command_survives_a_shell(tmp_path, capsys):
+    write_folder(tmp_path / "scans of mine")
+    root = tmp_path / "kitti of mine"
+    assert run("data=folder", f"data.root='{tmp_path}/scans of mine'", "to=kitti_00-08", f"to.root='{root}'") == 0
+    printed = capsys.readouterr().out
+    assert printed.count("writing sequence") == printed.count(" -> ") == 2
+    words = subprocess.run(["bash", "-c", f"printf '%s\\n' {printed.split('train.py ')[1]}"], stdout=subprocess.PIPE)
+    data = compose_data_set(words.stdout.decode().splitlines())
+    assert data.root == root and len(data.names) == 2
+    assert data.train_sequences == data.val_sequences == data.test_sequences
+    assert [len(data.sequence(name)) for name in data.train_sequences] == [2, 2]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_nothing_is_written_over(name, tmp_path):
+    sequence, sensor, distorted, _ = FORMATS[name]
+    target = target_of(name, tmp_path)
+    export(simulated(replace(sensor, columns=64), distorted, frames=3), target, sequence)
+    before = contents(tmp_path)
+    with pytest.raises(UserError, match=r"is there already(.|\n)*to\.root"):
+        export(simulated(replace(sensor, columns=64), distorted, frames=2), target, sequence)
+    assert contents(tmp_path) == before
+
+
+def test_poses_without_scans_are_not_written_over_either(tmp_path, capsys):
+    write_folder(tmp_path / "scans")
+    poses = tmp_path / "kitti" / "poses" / "01.txt"
+    poses.parent.mkdir(parents=True)
+    poses.write_text("of someone else\n")
+    (tmp_path / "kitti" / "sequences").mkdir()
+    to = ("to=kitti_00-08", f"to.root={tmp_path}/kitti", "to.train_sequences=['00','01']")
+    assert run("data=folder", f"data.root={tmp_path}/scans", *to, "to.val_sequences=[]", "to.test_sequences=[]") == 1
+    assert f"{poses} is there already" in capsys.readouterr().out
+    assert list(contents(tmp_path / "kitti")) == [poses]
+
+
+def test_calibrations_of_other_drives_are_not_written_over(tmp_path):
+    drive, target = simulated(hdl64(64), True, frames=2), target_of("kitti_raw", tmp_path)
+    export(drive, target, "2011_09_26_drive_0009")
+    export(drive, target, "2011_09_26_drive_0010")  # the same calibration
+    calibration = tmp_path / "2011_09_26" / "calib_imu_to_velo.txt"
+    calibration.write_text("R: of the genuine data set\n")
+    with pytest.raises(UserError, match=r"calib_imu_to_velo\.txt belongs to other sequences"):
+        export(drive, target, "2011_09_26_drive_0011")
+    assert calibration.read_text().endswith("genuine data set\n")
+    assert len(list(tmp_path.glob("*/*_sync"))) == 2
+
+
+def test_names_are_shared_out_without_training_on_what_is_held_out():
+    source = target_of("simulated_urban", "x")
+    target = target_of("kitti_00-08", "y")
+    names = matched_names(source, target)
+    assert names["urban_06"] == "07" and names["urban_07"] == "09"
+    assert [names.get(name) for name in source.train_sequences[:9]] == [*(f"0{i}" for i in range(7)), "08", None]
+    assert len(set(names.values())) == len(names) == 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("to=simulated_urban", "to.root=x"), "kitti_00-08|"),
+        (("to=kitti_00-08", "to.root=x", "suffix=.ply"), "to=folder"),
+        (("to=folder", "to.root=x", "suffix=.las"), "suffix=.bin|.npy|.pcd|.ply"),
+    ],
+)
+def test_what_cannot_be_written_is_said_with_what_can(arguments, said, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_folder(tmp_path / "scans")
+    assert run("data=folder", f"data.root={tmp_path}/scans", *arguments) == 1
+    assert said in capsys.readouterr().out and not (tmp_path / "x").exists()
+
+
+def test_the_options_named_in_the_advice_are_options():
+    with pytest.raises(UserError) as error:
+        format_of(target_of("simulated_urban", "x"))
+    options = str(error.value).split("to=")[1].split("|")
+    assert len(options) == 7 and set(options) <= set(data_groups())
+
+
 def test_the_car_goes_where_its_packets_say(tmp_path):
     drive = simulated(hdl64(64), True)
     export(drive, target_of("kitti_raw", tmp_path), "2011_09_26_drive_0009")
@@ -143,8 +242,9 @@ def test_the_command_writes_all_sequences_and_tells_how_to_train_on_them(tmp_pat
         main(arguments)
     printed = capsys.readouterr().out
     assert exited.value.code == 0
-    assert "urban_06 (val) -> 07: 2 scans" in printed and "urban_07 (test) -> 09" in printed
-    suggested = [word.strip("'") for word in printed.split("train.py ")[1].split()]
+    assert "urban_06 -> 07: 2 scans" in printed and "urban_07 -> 09" in printed
+    suggested = shlex.split(printed.split("train.py ")[1])
     data = compose_data_set(suggested)
     assert len(data.train_sequences) == 2 and data.check().usable
+    assert "" not in suggested and not {*data.train_sequences} & {*data.val_sequences, *data.test_sequences}
     assert torch.equal(data.sequence("09").T_world_lidar[0], se3.identity())

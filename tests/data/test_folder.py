@@ -62,6 +62,8 @@ def test_deskewing_needs_point_times(tmp_path):
     assert len(folder(tmp_path, deskew=True).sequence("with")) == 1
     with pytest.raises(UserError, match=r"data\.deskew=false"):
         folder(tmp_path, deskew=True).sequence("without")
+    report = folder(tmp_path, deskew=True).check()
+    assert not report.usable and "without" in details(report, "missing")
 
 
 def test_relative_times_of_any_unit():
@@ -105,15 +107,18 @@ def test_tum_ground_truth_in_order_where_scans_have_no_times(tmp_path):
         ("poses.txt", kitti_rows(curve(2)), "2 poses for 3 scans"),
         ("poses.txt", "", "empty"),
         ("poses.txt", "1 2 3\n" * 3, "3 numbers"),
+        ("poses.txt", "\x80\xff\xfe", "cannot be read"),
+        ("times.txt", "0\n1\n2\n3\n4\n", "5 times for 3 scans"),
         ("times.txt", "0\n1\n", "2 times for 3 scans"),
         ("times.txt", "", "empty"),
     ],
 )
 def test_damaged_ground_truth_and_times(tmp_path, file, content, problem):
     write_scans(tmp_path / "drive")
-    (tmp_path / "drive" / file).write_text(content)
+    (tmp_path / "drive" / file).write_bytes(content.encode("latin-1"))
     with pytest.raises(DamagedFileError, match=problem):
         folder(tmp_path).sequence("drive")
+    assert not folder(tmp_path).check().usable
 
 
 def test_clocks_that_do_not_agree(tmp_path):

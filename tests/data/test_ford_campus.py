@@ -142,6 +142,18 @@ def test_further_sequences_and_gaps_are_listed(tmp_path):
     assert "gaps in the numbering: 76" in details(report, "odd")
 
 
+def test_check_reads_one_scan_and_keeps_no_poses(tmp_path, monkeypatch):
+    write_ford_campus(tmp_path)
+    reads = []
+    read_scan = ford_campus.read_scan
+    monkeypatch.setattr(ford_campus, "read_scan", lambda path: reads.append(path) or read_scan(path))
+    assert ford(tmp_path).check().usable
+    assert set(reads) == {scan_file(tmp_path, 75)}
+    assert not (tmp_path / NAME / "lidarlearn_poses.npz").exists()
+    savemat(scan_file(tmp_path, 75), {"OTHER": np.random.default_rng(0).normal(size=1000)})
+    assert "no MATLAB file with a structure SCAN" in details(ford(tmp_path).check(), "missing")
+
+
 def test_deskewing_compensated_scans_is_refused(tmp_path):
     write_ford_campus(tmp_path)
     with pytest.raises(UserError, match=r"data\.deskew=false"):

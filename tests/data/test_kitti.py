@@ -179,6 +179,51 @@ def test_check_looks_at_names_and_sizes_only(tmp_path, monkeypatch):
     assert "1000 empty or truncated" in details(report, "missing")
 
 
+def test_only_kitti_s_own_names_are_scans(tmp_path):
+    written = write_kitti_odometry(tmp_path)
+    velodyne = tmp_path / "sequences/04/velodyne"
+    for stray in ("000002 (1).bin", "scan.bin", "0000003.bin"):
+        (velodyne / stray).write_bytes((velodyne / "000002.bin").read_bytes())
+    sequence = kitti(tmp_path).sequence("04")
+    assert sequence.scans.numbers == [0, 1, 2, 3, 4]
+    assert np.allclose(sequence.T_world_lidar, written.T_world_lidar, atol=1e-9)
+    report = kitti(tmp_path).check()
+    assert report.usable and "3 files that are not named like scans" in details(report, "odd")
+    assert "'0000003.bin', '000002 (1).bin', 'scan.bin'" in details(report, "odd")
+
+
+def test_an_absent_sequence_says_what_is_there_and_which_setting_names_it(tmp_path):
+    write_kitti_odometry(tmp_path, "04")
+    data = kitti(tmp_path, val_sequences=["09"])
+    with pytest.raises(DataSetNotFoundError, match=r"change: +data\.val_sequences to .*\(04\), or data\.root"):
+        data.sequence("09")
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "problem"),
+    [
+        ("sequences/04/calib.txt", bytes(range(128, 256)), "cannot be read"),
+        ("sequences/04/calib.txt", b"P0: 1 2 3\n", "no line 'Tr:'"),
+        ("sequences/04/times.txt", b"one\ntwo\nthree\nfour\nfive\n", "not a table of numbers"),
+        ("poses/04.txt", bytes(range(128, 256)) + b"\n\n\n\nx", "cannot be read"),
+        ("poses/04.txt", b"1 2 3\n" * 5, "3 numbers in a row"),
+    ],
+)
+def test_check_opens_what_looks_whole(tmp_path, file, content, problem):
+    write_kitti_odometry(tmp_path)
+    (tmp_path / file).write_bytes(content)
+    with pytest.raises(DamagedFileError, match=problem):
+        kitti(tmp_path).sequence("04")
+    report = kitti(tmp_path).check()
+    assert not report.usable and problem in details(report, "missing")
+
+
+def test_check_knows_that_nothing_is_to_deskew(tmp_path):
+    write_kitti_odometry(tmp_path)
+    report = kitti(tmp_path, deskew=True).check()
+    assert not report.usable and "data.deskew=false" in details(report, "missing")
+
+
 @pytest.mark.realdata
 def test_genuine_sequence_04(real_data):
     sequence = kitti(real_data / "kitti_odometry").sequence("04")

@@ -147,6 +147,22 @@ def test_a_truncated_scan(tmp_path):
     assert not raw(tmp_path).check().usable
 
 
+def test_files_of_other_names_are_no_scans_or_packets(tmp_path):
+    written = write_kitti_raw(tmp_path)
+    for scans, name in (("velodyne_points", "0000000002.bin"), ("oxts", "0000000002.txt")):
+        file = folder(tmp_path) / scans / "data" / name
+        file.with_stem(file.stem + "_copy").write_bytes(file.read_bytes())
+    T = raw(tmp_path).sequence(DRIVE).T_world_lidar
+    assert np.allclose(T, written.T_world_lidar, atol=1e-4)
+    assert "'0000000002_copy.bin'" in details(raw(tmp_path).check(), "odd")
+
+
+def test_a_drive_of_kitti_odometry_is_found_under_its_number(tmp_path):
+    write_kitti_raw(tmp_path, drive=ODOMETRY_DRIVES["04"].name)
+    report = raw(tmp_path, name="04").check()
+    assert report.usable and "not among the configured" not in details(report, "found")
+
+
 @pytest.mark.realdata
 def test_genuine_drive_0009(real_data):
     sequence = raw(real_data / "kitti_raw").sequence(DRIVE)

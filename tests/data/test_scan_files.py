@@ -47,6 +47,15 @@ def test_fingerprint_follows_files_and_settings_but_not_the_place(tmp_path):
     assert a.fingerprint("R") != list_scans(tmp_path / "b", (".bin",)).fingerprint("R")
 
 
+@pytest.mark.parametrize("changed", ["0.bin", "5.bin", "9.bin"])
+def test_fingerprint_tells_clouds_of_one_size_apart(tmp_path, changed):
+    for i in range(10):
+        write_float32(tmp_path / f"{i}.bin", random_points(i))
+    before = list_scans(tmp_path, (".bin",)).fingerprint("R")
+    write_float32(tmp_path / changed, random_points(99))
+    assert list_scans(tmp_path, (".bin",)).fingerprint("R") != before
+
+
 def test_rows_are_read_as_written(tmp_path):
     points = random_points(0)
     write_float32(tmp_path / "0.bin", points, columns=5)

@@ -7,6 +7,7 @@ import torch
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.simulated import SimulatedDataSet, image_path
+from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.sensors import hdl64
@@ -153,13 +154,32 @@ def test_drives_of_different_worlds_make_one_data_set(tmp_path):
 
 @pytest.mark.parametrize("name", ["village_00", "urban", "00", "urban_x"])
 def test_names_of_no_world_are_refused(made, name):
-    with pytest.raises(DataSetNotFoundError, match="urban_00"):
+    with pytest.raises(UserError, match=r"urban_07, highway_07"):
         made.sequence(name)
 
 
+def test_the_setting_that_names_no_world_is_told(tmp_path):
+    with pytest.raises(UserError, match=r"no simulated sequence 'town_1'.\n  change: data.test_sequences to names"):
+        _data_set(tmp_path, test_sequences="town_1").prepare()
+
+
 def test_nothing_is_corrected_in_simulated_scans(tmp_path):
-    with pytest.raises(ValueError, match="beam_correction_deg"):
+    with pytest.raises(UserError, match=r"data\.beam_correction_deg=0\b"):
         _data_set(tmp_path, beam_correction_deg=0.205)
+
+
+def test_only_distorted_scans_are_deskewed(tmp_path):
+    with pytest.raises(UserError, match=r"data\.motion_distortion=true"):
+        _data_set(tmp_path, deskew=True)
+    assert _data_set(tmp_path, deskew=True, motion_distortion=True).deskew
+
+
+def test_what_other_code_made_stays_in_a_folder_of_its_own(made, tmp_path, monkeypatch):
+    before = made.folder(made._drive("urban_00"))
+    monkeypatch.setattr("lidarlearn.simulation.drive.source_digest", lambda *files, within: "changed")
+    after = made.folder(made._drive("urban_00"))
+    assert after.parent == made.root / "simulator_changed" and before.parent.parent == made.root
+    assert before.parent != after.parent and before.name != after.name
 
 
 def test_check_reports_what_is_there(made):

@@ -184,6 +184,12 @@ def test_the_fingerprint_knows_every_setting(change):
     assert Drive("urban", **settings).fingerprint != Drive("urban", **(settings | change)).fingerprint
 
 
+def test_the_fingerprint_knows_the_simulator(monkeypatch):
+    before = Drive("urban", seed=0, frames=5, sensor=SENSOR).fingerprint
+    monkeypatch.setattr("lidarlearn.simulation.drive.source_digest", lambda *files, within: "of other code")
+    assert Drive("urban", seed=0, frames=5, sensor=SENSOR).fingerprint != before
+
+
 @pytest.mark.parametrize("world", ["campus", "segway"])
 def test_every_preset_makes_scans(world):
     drive = Drive(world, seed=0, frames=3, sensor=replace(PRESETS[world].sensor(), columns=128))

@@ -1,13 +1,14 @@
 """What all formats ask of a drive."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from rich.progress import track
 from torch import Tensor
 
 from lidarlearn.data.kitti_raw import sweep_times
+from lidarlearn.data.progress import tracked
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.errors import UserError
 
@@ -15,9 +16,24 @@ PERIOD_S = 0.1
 _SWEEP_TOLERANCE = 0.01  # of a revolution
 
 
+def write_shared(path: Path, text: str) -> None:
+    """Write a file that all sequences of a copy share.
+
+    Raises:
+        UserError: it is there already, and says something else.
+    """
+    if path.is_file() and path.read_bytes() != text.encode():
+        raise UserError(
+            f"{path.absolute()} belongs to other sequences, and is not written over.\n"
+            "  change: to.root=/an/empty/folder"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
 def scans_of(drive: Sequence, name: str) -> Iterator[Scan]:
-    """All scans, with a progress bar."""
-    return iter(track(drive, f"writing sequence {name}", total=len(drive), transient=True))
+    """All scans, with their progress shown."""
+    return tracked(drive, f"writing sequence {name}", len(drive))
 
 
 def timestamps_of(drive: Sequence) -> Float[Tensor, "n"]:

@@ -8,12 +8,10 @@ from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
 from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.cloud_files import SUFFIXES
 from lidarlearn.data.export.drives import PERIOD_S, scans_of, timestamps_of
 from lidarlearn.data.export.kitti import matrix_row
 from lidarlearn.data.folder import Folder
 from lidarlearn.data.sequence import Sequence
-from lidarlearn.errors import UserError
 
 
 def write_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd") -> None:
@@ -28,8 +26,6 @@ def write_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd
         name: of the folder.
         suffix: .bin, .npy, .pcd or .ply.
     """
-    if suffix not in SUFFIXES:
-        raise UserError(f"scans cannot be written as {suffix}.\n  change: suffix={'|'.join(SUFFIXES)}")
     folder = target.root / name
     folder.mkdir(parents=True, exist_ok=True)
     for index, scan in enumerate(scans_of(drive, name)):

@@ -1,8 +1,12 @@
-"""Which module writes which data set."""
+"""Which module writes which data set, and where."""
 
+import glob
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+from lidarlearn.data.cloud_files import SUFFIXES
 from lidarlearn.data.export.folder import write_folder
 from lidarlearn.data.export.ford_campus import write_ford_campus
 from lidarlearn.data.export.kitti import write_kitti_odometry
@@ -18,20 +22,39 @@ from lidarlearn.data.kitti_raw import KittiRaw
 from lidarlearn.data.nclt import Nclt
 from lidarlearn.data.newer_college import NewerCollege
 from lidarlearn.data.sequence import DataSet, Sequence
+from lidarlearn.data.writable import writable
 from lidarlearn.errors import UserError
 
-_WRITERS: dict[type[DataSet], Callable[..., None]] = {
-    KittiOdometry: write_kitti_odometry,
-    KittiRaw: write_kitti_raw,
-    Kitti360: write_kitti_360,
-    FordCampus: write_ford_campus,
-    Nclt: write_nclt,
-    NewerCollege: write_newer_college,
-    Folder: write_folder,
+_REMEDY = "to.root=/an/empty/folder"
+
+
+@dataclass(frozen=True)
+class Format:
+    """How a data set is written.
+
+    Args:
+        option: a choice of `to=` on the command line that is written so.
+        write: takes a drive, the target and the sequence's name there.
+        places: below the root, what belongs to a sequence alone; `{}` stands for its name, `*` for anything.
+    """
+
+    option: str
+    write: Callable[[Sequence, Any, str], None]
+    places: tuple[str, ...] = ("{}",)
+
+
+_FORMATS: dict[type[DataSet], Format] = {
+    KittiOdometry: Format("kitti_00-08", write_kitti_odometry, ("sequences/{}", "poses/{}.txt")),
+    KittiRaw: Format("kitti_raw", write_kitti_raw, ("*/{}_sync",)),
+    Kitti360: Format("kitti_360", write_kitti_360, ("data_*/*_drive_{}_sync",)),
+    FordCampus: Format("ford_campus", write_ford_campus),
+    Nclt: Format("nclt", write_nclt, ("{}", "ground_truth/groundtruth_{}.csv")),
+    NewerCollege: Format("newer_college", write_newer_college),
+    Folder: Format("folder", write_folder, ("{}", "{}.txt", "{}.tum")),
 }
 
 
-def export(drive: Sequence, target: DataSet, name: str, **settings: Any) -> None:
+def export(drive: Sequence, target: DataSet, name: str, suffix: str | None = None) -> None:
     """Write a drive so that `target.sequence(name)` reads it back: same points, times, intensities and poses.
 
     The target's settings are undone on the way: where its reader raises every beam by 0.205 deg, the beams are written
@@ -41,12 +64,40 @@ def export(drive: Sequence, target: DataSet, name: str, **settings: Any) -> None
         drive: what is written.
         target: the data set, with its root, in whose format it is written.
         name: of the sequence there.
-        settings: of the format, such as `suffix` of a folder of scans.
+        suffix: of the scans of a plain folder: .bin, .npy, .pcd or .ply; None for .pcd.
 
     Raises:
-        UserError: the format cannot hold such a drive.
+        UserError: the format cannot hold such a drive, or there is such a sequence already.
     """
-    writer = _WRITERS.get(type(target))
-    if writer is None:
-        raise UserError(f"{target.title} cannot be written.\n  change: to={'|'.join(c.__name__ for c in _WRITERS)}")
-    writer(drive, target, name, **settings)
+    write = format_of(target, suffix).write
+    require_new(target, name)
+    writable(target.root, _REMEDY)
+    if suffix is not None:
+        write = partial(write_folder, suffix=suffix)
+    write(drive, target, name)
+
+
+def format_of(target: DataSet, suffix: str | None = None) -> Format:
+    """How a data set is written.
+
+    Raises:
+        UserError: it cannot be, or its scans cannot have that suffix.
+    """
+    form = _FORMATS.get(type(target))
+    if form is None:
+        options = "|".join(form.option for form in _FORMATS.values())
+        raise UserError(f"{target.title}: this data set cannot be written.\n  change: to={options}")
+    if suffix is not None and not isinstance(target, Folder):
+        raise UserError(f"{target.title} has its own kind of files.\n  change: leave out suffix={suffix}, or to=folder")
+    if suffix is not None and suffix not in SUFFIXES:
+        raise UserError(f"scans cannot be written as {suffix!r}.\n  change: suffix={'|'.join(SUFFIXES)}")
+    return form
+
+
+def require_new(target: DataSet, name: str) -> None:
+    """Raise UserError where anything of the sequence that is to be written is there already."""
+    for place in format_of(target).places:
+        for path in target.root.glob(place.format(glob.escape(name.removesuffix("_sync")))):
+            raise UserError(
+                f"{path.absolute()} is there already, and is not written over.\n  change: {_REMEDY}, or move it away"
+            )

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from lidarlearn.data.export.drives import ground_truth_of, require_sweeps, scans_of, timestamps_of
+from lidarlearn.data.export.drives import ground_truth_of, require_sweeps, scans_of, timestamps_of, write_shared
 from lidarlearn.data.export.kitti import matrix_row, write_velodyne_points
 from lidarlearn.data.export.kitti_raw import write_timestamps
 from lidarlearn.data.kitti_360 import Kitti360, drive_folder
@@ -24,7 +24,9 @@ def write_kitti_360(drive: Sequence, target: Kitti360, name: str) -> None:
     T_world_lidar = ground_truth_of(drive, target.title)
     velodyne = target.root / "data_3d_raw" / drive_folder(name) / "velodyne_points"
     poses, calibration = target.root / "data_poses" / drive_folder(name), target.root / "calibration"
-    for folder in (velodyne / "data", poses, calibration):
+    write_shared(calibration / "calib_cam_to_pose.txt", f"image_00: {matrix_row(_T_IMU_CAMERA)}\n")
+    write_shared(calibration / "calib_cam_to_velo.txt", f"{matrix_row(_T_LIDAR_CAMERA)}\n")
+    for folder in (velodyne / "data", poses):
         folder.mkdir(parents=True, exist_ok=True)
     for index, scan in enumerate(scans_of(drive, name)):
         write_velodyne_points(velodyne / "data" / f"{index:010d}.bin", scan, target.beam_correction_deg)
@@ -32,5 +34,3 @@ def write_kitti_360(drive: Sequence, target: Kitti360, name: str) -> None:
     T_world_imu = T_world_lidar @ _T_LIDAR_CAMERA @ torch.linalg.inv(_T_IMU_CAMERA)
     rows = (f"{index} {matrix_row(T)}\n" for index, T in enumerate(T_world_imu))
     (poses / "poses.txt").write_text("".join(rows))
-    (calibration / "calib_cam_to_pose.txt").write_text(f"image_00: {matrix_row(_T_IMU_CAMERA)}\n")
-    (calibration / "calib_cam_to_velo.txt").write_text(f"{matrix_row(_T_LIDAR_CAMERA)}\n")

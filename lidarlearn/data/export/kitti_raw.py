@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from lidarlearn.data.export.drives import PERIOD_S, ground_truth_of, require_sweeps, scans_of, timestamps_of
+from lidarlearn.data.export.drives import (
+    PERIOD_S,
+    ground_truth_of,
+    require_sweeps,
+    scans_of,
+    timestamps_of,
+    write_shared,
+)
 from lidarlearn.data.export.kitti import write_velodyne_points
 from lidarlearn.data.kitti_raw import KittiRaw
 from lidarlearn.data.oxts import EARTH_RADIUS_M
@@ -32,6 +39,11 @@ def write_kitti_raw(drive: Sequence, target: KittiRaw, name: str) -> None:
     if not number:
         raise UserError(f"{target.title}: {name!r} does not name a drive.\n  change: a name like 2011_09_26_drive_0009")
     folder = target.root / date / f"{name.removesuffix('_sync')}_sync"
+    T_lidar_imu = torch.eye(4, dtype=torch.float64)
+    T_lidar_imu[:3, 3] = torch.tensor(_LEVER_ARM_M)
+    translation = " ".join(f"{value:.6e}" for value in T_lidar_imu[:3, 3].tolist())
+    calibration = f"calib_time: 01-Jan-2011 00:00:00\nR: 1 0 0 0 1 0 0 0 1\nT: {translation}\n"
+    write_shared(folder.parent / "calib_imu_to_velo.txt", calibration)
     for part in ("velodyne_points/data", "oxts/data"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     for index, scan in enumerate(scans_of(drive, name)):
@@ -42,12 +54,6 @@ def write_kitti_raw(drive: Sequence, target: KittiRaw, name: str) -> None:
     for suffix, offset in (("_start", -PERIOD_S / 2), ("", 0.0), ("_end", PERIOD_S / 2)):
         write_timestamps(folder / "velodyne_points" / f"timestamps{suffix}.txt", day, middles + offset)
     write_timestamps(folder / "oxts" / "timestamps.txt", day, middles)
-    T_lidar_imu = torch.eye(4, dtype=torch.float64)
-    T_lidar_imu[:3, 3] = torch.tensor(_LEVER_ARM_M)
-    translation = " ".join(f"{value:.6e}" for value in T_lidar_imu[:3, 3].tolist())
-    (folder.parent / "calib_imu_to_velo.txt").write_text(
-        f"calib_time: 01-Jan-2011 00:00:00\nR: 1 0 0 0 1 0 0 0 1\nT: {translation}\n"
-    )
     packets = _packets((T_world_lidar @ T_lidar_imu).numpy(), middles.numpy())
     for index, row in enumerate(packets):
         text = " ".join(f"{value:.14g}" for value in row)

@@ -1,0 +1,77 @@
+"""Whether scans fit the image of their sensor."""
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.data import compose_data_set
+from lidarlearn.data.field_of_view import misfit
+from lidarlearn.data.folder import Folder
+from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.simulation import sensors
+from tests.box_world import SMALL, BoxDrives
+
+IMAGES = sorted(path.stem for path in (config_directory() / "projection").glob("*.yaml"))
+SENSORS = {
+    "hdl64": sensors.hdl64(64),
+    "hdl32": sensors.hdl32(64),
+    "hdl32_inverted": sensors.hdl32_inverted(64),
+    "vlp16": sensors.vlp16(64),
+    "os1_64": sensors.os1_64(64),
+}
+
+
+def image(name):
+    with initialize_config_dir(str(config_directory().absolute()), version_base="1.3"):
+        return instantiate(compose(overrides=[f"+projection={name}"]).projection)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_sensor_fits_its_own_image(name):
+    points = torch.from_numpy(SENSORS[name].directions(0).reshape(-1, 3) * 20)
+    assert misfit("drive", points, image(name)) is None
+
+
+def test_a_wrong_image_is_told_with_what_would_be_right():
+    points = torch.from_numpy(sensors.os1_64(64).directions(0).reshape(-1, 3) * 20)
+    points = torch.cat([points, torch.zeros(9000, 3)])  # those that did not return do not count
+    remark = misfit("drive", points, image("hdl64"))
+    assert remark is not None
+    assert "44 % of the points of drive's first scan" in remark and "+3 to -24 deg" in remark
+    assert "from +21 to -21 deg" in remark and all(name in remark for name in IMAGES)
+
+
+def test_opening_sequences_warns_once(caplog):
+    data = BoxDrives(frames=3)
+    assert list(data.sequences(["0", "1"])) == ["0", "1"] and not caplog.records
+    data.projection = SphericalProjection(SMALL.height, SMALL.width, fov_up_deg=2.0, fov_down_deg=-20.0)
+    data.sequences(["0", "1"])
+    assert len(caplog.records) == 1 and "of 0's first scan" in caplog.text
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("data", "root", "sequence"),
+    [
+        (["data=kitti_00-08"], "kitti_odometry", "04"),
+        (["data=kitti_raw"], "kitti_raw", "2011_09_26_drive_0009"),
+        (["data=nclt"], "nclt", "2012-01-15"),
+        (["data=folder"], "kitti_pairs", "00"),
+        (["data=folder", "projection@data.projection=os1_64"], "ouster_mcd", "ouster_mcd"),
+        (["data=folder", "projection@data.projection=hdl32"], "hdl32_pair", "hdl32_pair"),
+    ],
+)
+def test_genuine_scans_fit_the_images_of_their_sensors(real_data, data, root, sequence):
+    data_set = compose_data_set([*data, f"data.root={real_data / root}"])
+    points = data_set.sequence(sequence).scan(0).points
+    assert misfit(sequence, points, data_set.projection) is None
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", ["ouster_mcd", "hdl32_pair"])
+def test_genuine_scans_of_other_sensors_do_not_fit_the_default(real_data, name):
+    data = Folder(real_data / name, SphericalProjection())
+    odd = " ".join(finding.detail for finding in data.check().findings if finding.level == "odd")
+    assert data.check().usable and "lie outside the image" in odd
