@@ -6,7 +6,6 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from lidarlearn.commands.configs import config_directory
-from lidarlearn.evaluation.methods import BACKENDS, BASELINES, INITIALIZATIONS
 
 CONFIGS = config_directory()
 GROUPS = {
@@ -32,8 +31,10 @@ def test_every_option_is_named(program, group):
 
 
 def test_the_parts_of_methods_are_named():
-    parts = {part for backend in BACKENDS for part in backend.split("_")}
-    assert {*INITIALIZATIONS, *parts, *BASELINES} <= words(help_of("evaluate"))
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        config = compose("evaluate")
+    parts = {part for backend in config.odometry for part in backend.split("_")}
+    assert {*config.initialization, *parts, *config.baseline} <= words(help_of("evaluate"))
 
 
 @pytest.mark.parametrize("program", GROUPS)
