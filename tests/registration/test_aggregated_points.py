@@ -172,7 +172,7 @@ def test_moments_at_a_great_distance_from_the_origin_lose_little():
     torch.testing.assert_close(far_cloud.normals, near_cloud.normals, rtol=0, atol=1e-4)
 
 
-def test_planes_of_moments_and_of_covariances_agree():
+def test_the_normal_of_a_plane_is_where_its_points_vary_least():
     points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).double() * torch.tensor([1.0, 0.7, 0.02])
     centred = points - points.mean(dim=0)
     covariance = (centred.T @ centred / 50).flatten()[[0, 1, 2, 4, 5, 8]]
