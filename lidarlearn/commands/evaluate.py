@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import OverrideParseException
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
 from lidarlearn.commands import entry_point
+from lidarlearn.commands.checkpoint_options import add_data, chosen_data
 from lidarlearn.commands.protocol import differing_settings, evaluation_protocol, method_settings
 from lidarlearn.commands.run_folder import code_digest, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
@@ -32,18 +30,15 @@ from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.submission import is_kitti_test_set, write_submission
 from lidarlearn.evaluation.trajectories import find_trajectories, read_trajectory, to_lidar_frame
 from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
-from lidarlearn.training.checkpoints import load_checkpoint
-from lidarlearn.training.parts import require_trusted
 
 _WITH_NETWORK = ("posenet", "posenet+p_f2m", "cv+p_f2m")
 _WITHOUT_NETWORK = ("cv+p_f2m", "cv+kd_f2m", "cv+vh_f2m")
-_DATA_OF_CHECKPOINT = "checkpoint"  # the choice of data that stands for the checkpoint's own
 
 
 def main() -> None:
     """Entry point of `evaluate.py` and `lidarlearn-evaluate`."""
     with tempfile.TemporaryDirectory() as folder:
-        entry_point.run(_evaluate_as_chosen, "evaluate", lambda: _add_data_of_checkpoint(sys.argv, Path(folder)))
+        entry_point.run(_evaluate_as_chosen, "evaluate", lambda: add_data(sys.argv, Path(folder)))
 
 
 @dataclass(frozen=True)
@@ -166,10 +161,7 @@ def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
 
 
 def _evaluate_as_chosen(config: DictConfig) -> None:
-    name = HydraConfig.get().runtime.choices["data"]
-    if name == _DATA_OF_CHECKPOINT:
-        name = load_checkpoint(Path(config.ckpt))["hyper_parameters"]["trained_on"]["data_name"]
-    evaluate(config, name)
+    evaluate(config, chosen_data(config))
 
 
 def _methods(config: DictConfig) -> list[Method]:
@@ -216,26 +208,3 @@ def _report(run_folder: Path, protocol: dict[str, Any], evaluation: Evaluation, 
         writer.add_text("results", (run_folder / "results.md").read_text())
     print_tables(report_tables(protocol["data"], scores, trained_on, layout))
     print(f"results: {run_folder / 'results.md'}  plots: {run_folder / 'plots'}")
-
-
-def _add_data_of_checkpoint(arguments: list[str], folder: Path) -> None:
-    """Let `ckpt=...` without `data=...` choose the data the checkpoint was trained on.
-
-    Its config becomes one more option of the group `data`, so every override of a setting works on it as on others.
-    """
-    given = {override.split("=", 1)[0].lstrip("+"): override for override in arguments[1:] if "=" in override}
-    if "ckpt" not in given or "data" in given:
-        return
-    try:
-        path = OverridesParser.create().parse_override(given["ckpt"]).value()
-    except OverrideParseException:
-        return  # composing the configuration will say what is wrong
-    if path is None:
-        return
-    if not isinstance(path, str):
-        raise UserError(f"{given['ckpt']}: each checkpoint may come with data of its own\n  change: add data=...")
-    data = load_checkpoint(Path(path))["hyper_parameters"]["trained_on"]["data"]
-    require_trusted(data)
-    (folder / "data").mkdir()
-    OmegaConf.save(OmegaConf.create(data), folder / "data" / f"{_DATA_OF_CHECKPOINT}.yaml")
-    arguments += [f"data={_DATA_OF_CHECKPOINT}", f"hydra.searchpath=[file://{folder}]"]

@@ -3,6 +3,9 @@
 import os
 import shlex
 import string
+import sys
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +16,11 @@ from omegaconf import DictConfig, OmegaConf
 
 import lidarlearn
 from lidarlearn.commands import entry_point
+from lidarlearn.commands.checkpoint_options import chosen_data
+from lidarlearn.commands.resume import add_settings, require_resumable, settings_to_keep
 from lidarlearn.commands.run_folder import git_revision, write_run_description
 from lidarlearn.data.datamodule import OdometryDataModule
 from lidarlearn.errors import UserError
-from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.module import PoseNetModule
 from lidarlearn.training.parts import build
 from lidarlearn.training.quiet import quiet
@@ -26,7 +30,8 @@ _PLAIN_CHARACTERS = frozenset(string.ascii_letters + string.digits + "/._-:+")
 
 def main() -> None:
     """Entry point of `train.py` and `lidarlearn-train`."""
-    entry_point.run(lambda config: _train_and_say_what_next(config), "train")
+    with tempfile.TemporaryDirectory() as folder:
+        entry_point.run(_train_and_say_what_next, "train", lambda: add_settings(sys.argv, Path(folder)))
 
 
 def train(config: DictConfig, data_name: str) -> Path:
@@ -48,7 +53,7 @@ def train(config: DictConfig, data_name: str) -> Path:
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     module = build_module(config, datamodule, data_name)
     if config.ckpt is not None:
-        _check_resumable(Path(config.ckpt), module, config.trainer.max_epochs)
+        require_resumable(Path(config.ckpt), module, config.trainer.max_epochs)
     trainer: Trainer = instantiate(config.trainer)
     if trainer.is_global_zero:
         write_run_description(run_folder, config)
@@ -57,21 +62,27 @@ def train(config: DictConfig, data_name: str) -> Path:
     return best if best.exists() else best.with_name("last.ckpt")
 
 
-def evaluate_command(checkpoint: Path) -> str:
-    """The command that evaluates a checkpoint, as it can be pasted into a shell."""
+def evaluate_command(checkpoint: Path, overrides: Sequence[str] = ()) -> str:
+    """The command that evaluates a checkpoint, as it can be pasted into a shell.
+
+    Args:
+        checkpoint: the file.
+        overrides: of its training; where the data lie is told anew, since a checkpoint does not say.
+    """
     path = str(checkpoint.relative_to(Path.cwd()) if checkpoint.is_relative_to(Path.cwd()) else checkpoint)
     if not _PLAIN_CHARACTERS.issuperset(path):
         path = '"' + path.replace('"', r"\"") + '"'  # for Hydra's grammar; the shell's quotes come around it
     program = "python evaluate.py" if Path("evaluate.py").is_file() else "lidarlearn-evaluate"
-    return f"{program} {shlex.quote(f'ckpt={path}')}"
+    arguments = [f"ckpt={path}", *(override for override in overrides if override.startswith("data.root="))]
+    return f"{program} {shlex.join(arguments)}"
 
 
 def _train_and_say_what_next(config: DictConfig) -> None:
-    checkpoint = train(config, HydraConfig.get().runtime.choices["data"]).resolve()
+    checkpoint = train(config, chosen_data(config)).resolve()
     first_process = os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
     if first_process and checkpoint.exists():
         print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
-        print(f"next:       {evaluate_command(checkpoint)}")
+        print(f"next:       {evaluate_command(checkpoint, HydraConfig.get().overrides.task)}")
 
 
 def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: str) -> PoseNetModule:
@@ -91,11 +102,12 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
 
     p = datamodule.projection
     trained_on = {
-        "data": plain("data"),
+        "data": {key: value for key, value in plain("data").items() if key != "root"},
         "data_name": data_name,
         "loss": config.loss["_target_"].rpartition(".")[2],
         "git": git_revision(),
         "lidarlearn": lidarlearn.__version__,
+        "settings": settings_to_keep(config),
         "projection": {
             "height": p.height,
             "width": p.width,
@@ -107,18 +119,4 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
     if config.scheduler not in config.schedulers:
         raise UserError(f"scheduler={config.scheduler}: choose one of {', '.join(config.schedulers)}")
     parts["scheduler"] = plain("schedulers")[config.scheduler]
-    return build(plain("module"), **parts, trained_on=trained_on)
-
-
-def _check_resumable(path: Path, module: PoseNetModule, max_epochs: int | None) -> None:
-    """Raise a `UserError` where a checkpoint cannot be continued with this configuration."""
-    checkpoint = load_checkpoint(path)
-    for part in ("model", "loss"):
-        was, now = checkpoint["hyper_parameters"][part], module.hparams[part]
-        if was != now:
-            raise UserError(
-                f"ckpt={path} was trained with {part} {was}\n  this run has {now}\n  change: one of the two"
-            )
-    done = checkpoint["epoch"] + 1
-    if max_epochs is not None and 0 <= max_epochs <= done:
-        raise UserError(f"ckpt={path} has already seen {done} epochs\n  change: trainer.max_epochs to more than that")
+    return build(plain("module"), PoseNetModule, **parts, trained_on=trained_on)

@@ -6,35 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from lidarlearn.commands import evaluate, evaluation
 from lidarlearn.commands.train import train
-from lidarlearn.evaluation.trajectories import write_kitti
-from tests.box_world import BoxSequence
+from tests.commands.scans import SENSOR
 from tests.training.runs import configured
 
-FRAMES = 6
-SENSOR = [
-    "data.projection.height=16", "data.projection.width=96", "data.projection.fov_up_deg=15.0",
-    "data.projection.fov_down_deg=-20.0",
-]  # fmt: skip
-
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
-
-
-@pytest.fixture(scope="module")
-def scans(tmp_path_factory):
-    """Two drives with ground truth as a folder of .npy files."""
-    root = tmp_path_factory.mktemp("scans")
-    for name in ("0", "1"):
-        drive = BoxSequence(name, FRAMES)
-        (root / name).mkdir()
-        for i, scan in enumerate(drive):
-            np.save(root / name / f"{i}.npy", scan.points.numpy())
-        write_kitti(root / name / "poses.txt", drive.T_world_lidar)
-    return root
 
 
 @pytest.fixture(scope="module")

@@ -50,6 +50,12 @@ def test_the_revision_is_a_commit_or_unknown():
     assert re.fullmatch(r"[0-9a-f]{40}(-modified)?|unknown", git_revision())
 
 
+def test_the_command_that_is_printed_knows_where_the_data_are(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    overrides = ["data=folder", "data.root=/my scans", "trainer.max_epochs=1"]
+    assert evaluate_command(tmp_path / "a.ckpt", overrides) == "lidarlearn-evaluate ckpt=a.ckpt 'data.root=/my scans'"
+
+
 @pytest.mark.parametrize(
     ("path", "printed"),
     [
