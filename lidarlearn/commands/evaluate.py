@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 from hydra.utils import instantiate
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig
 from torch import Tensor
 
 from lidarlearn.commands import entry_point
 from lidarlearn.commands.checkpoint_options import add_data, chosen_data
+from lidarlearn.commands.device import resolve_device
 from lidarlearn.commands.protocol import differing_settings, evaluation_protocol, method_settings
 from lidarlearn.commands.run_folder import code_digest, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
@@ -69,8 +70,7 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
         UserError: the data, the checkpoint, a trajectory or a setting is not as it should be.
     """
     _seed(config.seed)
-    with open_dict(config):
-        config.device = _device(config.device)
+    resolve_device(config)
     run_folder = Path(config.run_dir)
     methods = _methods(config)
     layout: TableLayout | None = instantiate(config.table, _convert_="all")
@@ -176,16 +176,6 @@ def _methods(config: DictConfig) -> list[Method]:
             setting = "ckpt" if network == "posenet" else f"networks.{network}"
             raise UserError(f"{method}: a trained network is needed\n  change: {setting}=RUN/checkpoints/best.ckpt")
     return methods
-
-
-def _device(name: str) -> str:
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and not torch.cuda.is_available():
-        raise UserError("device=cuda: torch finds no CUDA device\n  change: device=auto or device=cpu")
-    if name not in ("cpu", "cuda"):
-        raise UserError(f"device={name}: there is no such device\n  change: device=auto, cpu or cuda")
-    return name
 
 
 def _seed(seed: int) -> None:

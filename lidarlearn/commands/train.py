@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 import lidarlearn
 from lidarlearn.commands import entry_point
 from lidarlearn.commands.checkpoint_options import chosen_data
+from lidarlearn.commands.device import resolve_device
 from lidarlearn.commands.resume import add_settings, require_resumable, settings_to_keep
 from lidarlearn.commands.run_folder import git_revision, write_run_description
 from lidarlearn.data.datamodule import OdometryDataModule
@@ -49,6 +50,7 @@ def train(config: DictConfig, data_name: str) -> Path:
     """
     quiet()
     seed_everything(config.seed, workers=True, verbose=False)
+    resolve_device(config)
     run_folder = Path(config.run_dir)
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     module = build_module(config, datamodule, data_name)

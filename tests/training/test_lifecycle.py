@@ -123,6 +123,33 @@ def test_resuming_with_another_model_says_so(run, tmp_path):
         train(config, data_name="boxes")
 
 
+def resumed(folder, run_dir, loss, **drives):
+    """Go on for an epoch from a folder's last checkpoint, at a rate that spoils the network; the best one then."""
+    last = folder / "checkpoints" / "last.ckpt"
+    content = torch.load(last, weights_only=True)
+    for group in content["optimizer_states"][0]["param_groups"]:
+        group["lr"] = group["initial_lr"] = 1.0
+    spoilt = run_dir.parent / "checkpoints"
+    spoilt.mkdir()
+    torch.save(content, spoilt / "last.ckpt")
+    (spoilt / "best.ckpt").write_bytes((folder / "checkpoints" / "best.ckpt").read_bytes())
+    settings = (f"loss={loss}", f"trainer.max_epochs={EPOCHS + 1}", f"ckpt={spoilt}/last.ckpt", "~callbacks.images")
+    return load_checkpoint(train(configured(run_dir, *settings, frames=FRAMES, **drives), data_name="boxes"))
+
+
+def test_best_of_a_resumed_training_is_the_best_of_all(run, tmp_path):
+    folder, best, loss = run
+    after = resumed(folder, tmp_path / "resumed", loss)
+    worse = curves(tmp_path / "resumed")["val/error"][0][1]
+    assert worse > min(value for _, value in curves(folder)["val/error"])
+    assert after["epoch"] == load_checkpoint(best)["epoch"]
+
+
+def test_best_is_chosen_anew_where_other_drives_are_held_out(run, tmp_path):
+    folder, _, loss = run
+    assert resumed(folder, tmp_path / "resumed", loss, val_sequences=["1"])["epoch"] == EPOCHS
+
+
 @pytest.mark.slow
 def test_two_runs_from_one_seed_are_the_same(tmp_path):
     losses = []
