@@ -52,6 +52,8 @@ def train(config: DictConfig, data_name: str) -> Path:
     seed_everything(config.seed, workers=True, verbose=False)
     resolve_device(config)
     run_folder = Path(config.run_dir)
+    if os.environ.get("LOCAL_RANK", "0") == "0":  # the other processes come when the first has begun
+        _require_free(run_folder, config.ckpt)
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     module = build_module(config, datamodule, data_name)
     if config.ckpt is not None:
@@ -85,6 +87,18 @@ def _train_and_say_what_next(config: DictConfig) -> None:
     if first_process and checkpoint.exists():
         print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
         print(f"next:       {evaluate_command(checkpoint, HydraConfig.get().overrides.task)}")
+
+
+def _require_free(run_folder: Path, resumed: str | None) -> None:
+    """Raise a `UserError` where a run folder holds another training: curves and checkpoints would mix."""
+    folder = run_folder / "checkpoints"
+    found = sorted(folder.glob("*.ckpt"))
+    if found and (resumed is None or Path(resumed).resolve().parent != folder.resolve()):
+        raise UserError(
+            f"{run_folder} holds the checkpoints of another training\n"
+            f"  change: hydra.run.dir to another folder (hydra.sweep.dir or subdir with -m), or delete this one, "
+            f"or ckpt={folder / 'last.ckpt'} to go on with it"
+        )
 
 
 def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: str) -> PoseNetModule:

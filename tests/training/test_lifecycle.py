@@ -108,6 +108,15 @@ def test_resuming_goes_on_at_the_right_epoch(run, tmp_path):
     assert steps == list(range(EPOCHS * 8, (EPOCHS + 1) * 8))
 
 
+def test_a_folder_that_holds_another_training_is_refused(run, tmp_path):
+    folder, best, loss = run
+    for ckpt in ((), (f"ckpt={tmp_path}/elsewhere/last.ckpt",)):
+        with pytest.raises(UserError, match=r"another training(.|\n)*hydra\.run\.dir(.|\n)*ckpt=.*last\.ckpt"):
+            train(configured(folder, f"loss={loss}", *ckpt, frames=5), data_name="boxes")
+    with pytest.raises(UserError, match="already seen"):  # going on in the same folder is another matter
+        train(configured(folder, f"loss={loss}", f"ckpt={best}", "trainer.max_epochs=1", frames=5), data_name="boxes")
+
+
 def test_resuming_where_nothing_is_left_says_so(run, tmp_path):
     folder, _, loss = run
     checkpoint = folder / "checkpoints" / "last.ckpt"
