@@ -71,6 +71,8 @@ def readable_message(error: Exception) -> str | None:
     """
     if isinstance(error, UserError):
         return str(error)
+    if _is_misconfiguration(error):
+        return str(error)
     if isinstance(error, InstantiationException):
         cause = error.__cause__
         if not isinstance(cause, _SETTINGS_AT_FAULT) and not _is_misconfiguration(cause):

@@ -26,6 +26,7 @@ from lidarlearn.training.module import PoseNetModule
 from lidarlearn.training.parts import build
 from lidarlearn.training.quiet import quiet
 
+_PRECISIONS = ("None", "32-true", "32", "bf16-mixed", "bf16", "16-mixed", "16")
 _PLAIN_CHARACTERS = frozenset(string.ascii_letters + string.digits + "/._-:+")
 
 
@@ -51,6 +52,7 @@ def train(config: DictConfig, data_name: str) -> Path:
     quiet()
     seed_everything(config.seed, workers=True, verbose=False)
     resolve_device(config)
+    _require_workable(config)
     run_folder = Path(config.run_dir)
     if os.environ.get("LOCAL_RANK", "0") == "0":  # the other processes come when the first has begun
         _require_free(run_folder, config.ckpt)
@@ -87,6 +89,31 @@ def _train_and_say_what_next(config: DictConfig) -> None:
     if first_process and checkpoint.exists():
         print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
         print(f"next:       {evaluate_command(checkpoint, HydraConfig.get().overrides.task)}")
+
+
+def _require_workable(config: DictConfig) -> None:
+    """Raise a `UserError` where settings do not go together, before hours are spent on data."""
+    trainer = config.trainer
+    if config.scheduler not in config.schedulers:
+        raise UserError(f"scheduler={config.scheduler}: choose one of {', '.join(config.schedulers)}")
+    if str(trainer.precision) not in _PRECISIONS:
+        raise UserError(
+            f"trainer.precision={trainer.precision}: scans need more than 16 bits, and poses no more than 32\n"
+            f"  change: trainer.precision to one of {', '.join(_PRECISIONS)}"
+        )
+    if trainer.gradient_clip_val and "16" in str(trainer.precision) and config.optimizer.get("fused"):
+        raise UserError(
+            f"trainer.gradient_clip_val={trainer.gradient_clip_val} with trainer.precision={trainer.precision}: "
+            "a fused optimizer clips no gradients of 16 bits\n  change: optimizer.fused=false"
+        )
+    by_steps = config.schedulers[config.scheduler].get("total_steps", 0) is None
+    if by_steps and trainer.max_epochs == -1 and trainer.max_steps == -1:
+        raise UserError(
+            f"scheduler={config.scheduler} goes by the length of the training, and trainer.max_epochs=-1 has no end\n"
+            "  change: trainer.max_epochs, or scheduler=step or constant"
+        )
+    if not trainer.logger and "learning_rate" in config.callbacks:
+        raise UserError("trainer.logger=false: nothing takes the learning rate\n  change: add ~callbacks.learning_rate")
 
 
 def _require_free(run_folder: Path, resumed: str | None) -> None:
@@ -132,7 +159,5 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
         },
     }
     parts = {node: plain(node) for node in ("model", "loss", "optimizer")}
-    if config.scheduler not in config.schedulers:
-        raise UserError(f"scheduler={config.scheduler}: choose one of {', '.join(config.schedulers)}")
     parts["scheduler"] = plain("schedulers")[config.scheduler]
     return build(plain("module"), PoseNetModule, **parts, trained_on=trained_on)

@@ -5,6 +5,7 @@ import sys
 import pytest
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from lidarlearn.commands import entry_point
 from lidarlearn.commands.entry_point import readable_message
@@ -53,6 +54,12 @@ def test_a_user_error_is_its_message(monkeypatch, tmp_path, capsys):
     out = capsys.readouterr()
     assert exit_.value.code == 1
     assert out.err == "error: scan 3 is empty\n  change: data.root\n" and not out.out
+
+
+def test_what_lightning_cannot_do_is_its_message(monkeypatch, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run(monkeypatch, tmp_path, task=raises(MisconfigurationException("no logger")))
+    assert capsys.readouterr().err == "error: no logger\n"
 
 
 def test_a_defect_keeps_its_stack_trace(monkeypatch, tmp_path):
