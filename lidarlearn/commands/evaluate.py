@@ -11,14 +11,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torch import Tensor
 
 from lidarlearn.commands import entry_point
-from lidarlearn.commands.checkpoint_options import add_data, chosen_data
+from lidarlearn.commands.checkpoint_options import OPTION, add_data, chosen_data
 from lidarlearn.commands.device import resolve_device
-from lidarlearn.commands.protocol import differing_settings, evaluation_protocol, method_settings
+from lidarlearn.commands.protocol import describe_networks, differing_settings, evaluation_protocol, method_settings
 from lidarlearn.commands.run_folder import code_digest, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
@@ -73,6 +74,7 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     resolve_device(config)
     run_folder = Path(config.run_dir)
     methods = _methods(config)
+    networks = {} if config.trajectories else describe_networks(config, methods)
     layout: TableLayout | None = instantiate(config.table, _convert_="all")
     data: DataSet = instantiate(config.data)
     data.prepare(data.test_sequences)
@@ -80,10 +82,13 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     if not sequences:
         raise UserError('data.test_sequences is empty\n  change: data.test_sequences=["..."]')
     write_run_description(run_folder, config)
-    protocol = evaluation_protocol(config, data_name, methods, sequences)
+    protocol = evaluation_protocol(config, data_name, networks, sequences)
     poses: dict[str, dict[str, Tensor]] = {}
     scores: list[Score] = []
-    results = _foreign(config, sequences) if config.trajectories else _own(config, methods, sequences, run_folder)
+    if config.trajectories:
+        results = _foreign(config, sequences)
+    else:
+        results = _own(config, methods, networks, sequences, run_folder)
     try:
         for row, T_world_lidar in results:
             scores.append(row)
@@ -101,13 +106,17 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
 
 
 def _own(
-    config: DictConfig, methods: Series[Method], sequences: Mapping[str, Sequence], run_folder: Path
+    config: DictConfig,
+    methods: Series[Method],
+    networks: Mapping[str, Mapping[str, Any]],
+    sequences: Mapping[str, Sequence],
+    run_folder: Path,
 ) -> Iterator[tuple[Score, Tensor]]:
     """Run every method on every sequence, unless the run folder holds that run, and score what they export."""
     code = code_digest()
     with RunProgress() as progress:
         for method in methods:
-            own = {**method_settings(config, method), "code": code}
+            own = {**method_settings(config, method, networks), "code": code}
             for sequence in sequences.values():
                 export = Export(run_folder / "trajectories" / str(method), sequence.name)
                 settings = {"scans": sequence.fingerprint, **own}
@@ -161,7 +170,18 @@ def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
 
 
 def _evaluate_as_chosen(config: DictConfig) -> None:
+    _require_use_of_checkpoint(config)
     evaluate(config, chosen_data(config))
+
+
+def _require_use_of_checkpoint(config: DictConfig) -> None:
+    """Raise a `UserError` where `ckpt=...` gives neither a network nor the data."""
+    used = {config.networks.get(method.initialization) for method in _methods(config)}
+    if config.ckpt is not None and config.ckpt not in used and HydraConfig.get().runtime.choices["data"] != OPTION:
+        raise UserError(
+            f"ckpt={config.ckpt}: no method runs this network\n"
+            f"  change: networks.posenet={config.ckpt} where an experiment names another, or methods=[posenet,...]"
+        )
 
 
 def _methods(config: DictConfig) -> list[Method]:
@@ -169,13 +189,7 @@ def _methods(config: DictConfig) -> list[Method]:
     if names is None:
         names = _WITH_NETWORK if config.ckpt else _WITHOUT_NETWORK
     names = [str(name) for name in ([names] if isinstance(names, str) else names)]
-    methods = [parse_method(name, config.networks) for name in names]
-    for method in () if config.trajectories else methods:
-        network = method.initialization
-        if network in config.networks and config.networks[network] is None:
-            setting = "ckpt" if network == "posenet" else f"networks.{network}"
-            raise UserError(f"{method}: a trained network is needed\n  change: {setting}=RUN/checkpoints/best.ckpt")
-    return methods
+    return [parse_method(name, config.networks) for name in names]
 
 
 def _seed(seed: int) -> None:

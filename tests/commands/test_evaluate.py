@@ -97,6 +97,34 @@ def test_a_network_that_is_not_there_is_named(call, tmp_path, capsys):
     assert "networks.other=RUN/checkpoints/best.ckpt" in capsys.readouterr().err
 
 
+@pytest.fixture
+def no_data(monkeypatch):
+    """Where data are asked for, it is too late."""
+    monkeypatch.setattr(evaluate, "instantiate", lambda *_, **__: 1 / 0)
+
+
+def refused(capsys, *arguments):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(sys, "argv", ["evaluate.py", *arguments])
+        evaluate.main()
+    return capsys.readouterr().err
+
+
+def test_all_networks_that_are_not_there_are_named_before_data_are_made(no_data, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    error = refused(capsys, "experiment=paper/generalization_sim", "device=cpu")
+    for name in ("campus", "urban"):
+        assert f"networks.posenet_{name}: no file outputs/networks/simulated_{name}/checkpoints/best.ckpt" in error
+        assert f"python train.py experiment=network/simulated_{name}" in error
+
+
+def test_a_checkpoint_that_nothing_uses_is_refused(no_data, checkpoint, tmp_path, capsys):
+    error = refused(capsys, f"ckpt='{checkpoint}'", "experiment=paper/kitti", f"hydra.run.dir={tmp_path}")
+    assert f"change: networks.posenet={checkpoint}" in error
+    error = refused(capsys, f"ckpt='{checkpoint}'", "data=folder", "methods=[cv+p_f2m]", f"hydra.run.dir={tmp_path}")
+    assert "no method runs this network" in error
+
+
 TABLE = (
     "table={_target_:lidarlearn.evaluation.layout.TableLayout,title:both,"
     "figure:relative_translation_error_percent,columns:{first:['0'],second:['1']}}"
