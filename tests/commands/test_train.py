@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from lidarlearn.commands import run_folder
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.run_folder import git_revision
 from lidarlearn.commands.train import evaluate_command
@@ -54,6 +56,17 @@ def test_the_command_that_is_printed_knows_where_the_data_are(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     overrides = ["data=folder", "data.root=/my scans", "trainer.max_epochs=1"]
     assert evaluate_command(tmp_path / "a.ckpt", overrides) == "lidarlearn-evaluate ckpt=a.ckpt 'data.root=/my scans'"
+
+
+def test_the_revision_is_not_that_of_a_project_with_lidarlearn_in_its_environment(tmp_path, monkeypatch):
+    installed = tmp_path / ".venv" / "lidarlearn" / "commands"
+    shutil.copytree(Path(run_folder.__file__).parent, installed)
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
+    for command in (["init", "-q"], [*identity, "commit", "-q", "--allow-empty", "-m", "of the project"]):
+        subprocess.run(["git", "-C", str(tmp_path), *command], check=True)
+    monkeypatch.setattr(run_folder, "_SOURCE", installed)
+    monkeypatch.setattr(run_folder, "__file__", str(installed / "run_folder.py"))
+    assert git_revision() == "unknown"
 
 
 @pytest.mark.parametrize(
