@@ -64,10 +64,11 @@ def add_settings(arguments: list[str], folder: Path) -> None:
         "trainer": _only(_OF_TRAINER, settings.get("trainer", {})),
         "scheduler": name,
         "schedulers": {name: schedule},
+        "lr_halving_epochs": schedule.get("milestones", []),
         **_only(("seed",), settings),
     }
-    if "milestones" in schedule:  # are set by this name
-        recipe["lr_halving_epochs"], schedule["milestones"] = schedule["milestones"], "${lr_halving_epochs}"
+    if "milestones" in schedule:
+        schedule["milestones"] = "${lr_halving_epochs}"  # by which the command line knows them
     for part in ("model", "loss", "optimizer"):
         write_option(folder, part, parts[part])
     write_option(folder, "recipe", recipe, header="# @package _global_\n")

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from lidarlearn.commands import evaluate, train
 from lidarlearn.commands.checkpoint_options import add_data
@@ -65,6 +66,16 @@ def test_a_training_goes_on_as_it_was_configured(checkpoint, tmp_path, monkeypat
     assert config.model.rotation_scale == 0.2
     assert (config.scheduler, config.schedulers.step.milestones) == ("step", [1])
     assert (config.trainer.max_epochs, config.trainer.limit_train_batches) == (2, 2)
+
+
+def test_a_schedule_without_milestones_goes_on_too(checkpoint, tmp_path):
+    content = torch.load(checkpoint, weights_only=True)
+    parts = content["hyper_parameters"]
+    parts["scheduler"] = {"_target_": "lidarlearn.training.schedules.WarmUpCosine", "total_steps": None}
+    parts["trained_on"]["settings"]["scheduler"] = "cosine"
+    torch.save(content, tmp_path / "cosine.ckpt")
+    config = composed(tmp_path / "o", tmp_path / "cosine.ckpt")
+    assert OmegaConf.to_container(config, resolve=True)["scheduler"] == "cosine"
 
 
 def test_the_command_line_and_experiments_come_after_the_checkpoint(checkpoint, tmp_path):
