@@ -11,6 +11,8 @@ _NOT_FOR_THE_USER = (
     r".*You're resuming from a checkpoint that ended before the epoch ended.*",  # checkpoints are of whole epochs
     r".*LeafSpec.*deprecated.*",  # Lightning's own use of torch
     r".*Total length of `list` across ranks is zero.*",  # one may go without validation
+    r".*It is recommended to use `self.log\('val/.*",  # every process has them from all: `PoseNetModule` gathers
+    r".*all_gather is deprecated.*",  # Lightning's own use of torch
     r".*could not find the monitored key.*",  # likewise, or a first epoch that is not validated yet
     r".*Consider setting `persistent_workers=True`.*",  # they are, where there are workers
     r".*The dirpath has changed from.*",  # a run that resumes may have a new folder
