@@ -34,7 +34,10 @@ def given_checkpoint(arguments: Sequence[str]) -> Path | None:
     except OverrideParseException:
         return None  # composing the configuration will say what is wrong
     if path is not None and not isinstance(path, str):
-        raise UserError(f"{given}: each checkpoint may come with data of its own\n  change: one at a time; to evaluate several, add data=...")
+        raise UserError(
+            f"{given}: each checkpoint may come with data of its own\n"
+            "  change: one at a time; to evaluate several, add data=..."
+        )
     return None if path is None else Path(path)
 
 

@@ -28,12 +28,15 @@ _RECIPE = f"recipe={OPTION}"  # comes after the defaults, and before experiments
 
 def settings_to_keep(config: DictConfig) -> dict[str, Any]:
     """What a checkpoint has to tell for a training to go on alike, beside its parts and its data."""
-    config_: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+
+    def plain(node: DictConfig, keys: tuple[str, ...]) -> dict[str, Any]:
+        values = {key: node[key] for key in keys}
+        return {k: OmegaConf.to_container(v, resolve=True) if OmegaConf.is_config(v) else v for k, v in values.items()}
+
     return {
-        "seed": config_["seed"],
-        "scheduler": config_["scheduler"],
-        "datamodule": {key: config_["datamodule"][key] for key in _OF_DATAMODULE},
-        "trainer": {key: config_["trainer"][key] for key in _OF_TRAINER},
+        **plain(config, ("seed", "scheduler")),
+        "datamodule": plain(config.datamodule, _OF_DATAMODULE),
+        "trainer": plain(config.trainer, _OF_TRAINER),
     }
 
 
