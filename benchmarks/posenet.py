@@ -36,7 +36,7 @@ def measure(options: report.Options) -> list[Row]:
     scans = [scan.points for scan in drive]
     projection = compose_data_set(["data=simulated_urban"]).projection
     model = PoseNet().to(options.device).eval()
-    network = TrainedNetwork(model, projection, options.device, trained_on={})
+    network = TrainedNetwork(model, projection, options.device)
     image = f"{projection.height}x{projection.width}"
     maps = torch.stack([projection.vertex_map(points) for points in scans]).to(options.device)
     pairs = 512 if options.device.type == "cuda" else 8

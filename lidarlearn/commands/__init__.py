@@ -1,1 +1,1 @@
-"""The commands: train and evaluate."""
+"""The commands (train, evaluate, data, evaluation) and what they share: options, messages, run folders."""

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.mistakes import explanation, require_parts
 from lidarlearn.errors import UserError
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -40,9 +41,10 @@ def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[
 
     def task_with_readable_errors(config: DictConfig) -> None:
         try:
+            require_parts(config)
             task(config)
         except Exception as error:
-            message = readable_message(error)
+            message = readable_message(error, config_name)
             hydra_config = HydraConfig.get()
             if message is None:
                 raise
@@ -56,7 +58,7 @@ def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[
         prepare()
         _application(task_with_readable_errors, config_name)()
     except Exception as error:
-        message = readable_message(error)
+        message = readable_message(error, config_name)
         if message is None:
             raise
         _exit(message)
@@ -64,12 +66,16 @@ def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[
         del os.environ[_FULL_ERROR]
 
 
-def readable_message(error: Exception) -> str | None:
+def readable_message(error: Exception, config_name: str = "train") -> str | None:
     """What to tell the user, None where the error is a defect.
 
-    Raised by Hydra or OmegaConf, it is about the command line or a yaml: their hints for programmers are left out.
+    Args:
+        error: whatever came up.
+        config_name: of the primary config, about which errors of Hydra and OmegaConf are.
     """
     if isinstance(error, UserError):
+        return str(error)
+    if _is_misconfiguration(error):
         return str(error)
     if isinstance(error, InstantiationException):
         cause = error.__cause__
@@ -81,8 +87,7 @@ def readable_message(error: Exception) -> str | None:
         remedy = "a value with '=', ',' or spaces needs quotes: 'ckpt=\"a=b.ckpt\"'"
         return f"{error.override}: {error.message.splitlines()[0]}; {remedy}"
     if isinstance(error, HydraException | OmegaConfBaseException):
-        lines = [line.strip() for line in str(error).partition("\nConfig search path:")[0].splitlines()]
-        return "  ".join(line for line in lines if line and not line.startswith(("See https", "object_type=", "^")))
+        return explanation(error, config_name, sys.argv[1:])
     return None
 
 

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import OverrideParseException
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig
 from torch import Tensor
 
 from lidarlearn.commands import entry_point
-from lidarlearn.commands.protocol import differing_settings, evaluation_protocol, method_settings
+from lidarlearn.commands.checkpoint_options import OPTION, add_data, chosen_data
+from lidarlearn.commands.device import resolve_device
+from lidarlearn.commands.protocol import describe_networks, differing_settings, evaluation_protocol, method_settings
 from lidarlearn.commands.run_folder import code_digest, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
@@ -32,18 +32,15 @@ from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.submission import is_kitti_test_set, write_submission
 from lidarlearn.evaluation.trajectories import find_trajectories, lidar_poses, read_trajectory
 from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
-from lidarlearn.training.checkpoints import load_checkpoint
-from lidarlearn.training.parts import require_trusted
 
 _WITH_NETWORK = ("posenet", "posenet+p_f2m", "cv+p_f2m")
 _WITHOUT_NETWORK = ("cv+p_f2m", "cv+kd_f2m", "cv+vh_f2m")
-_DATA_OF_CHECKPOINT = "checkpoint"  # the choice of data that stands for the checkpoint's own
 
 
 def main() -> None:
     """Entry point of `evaluate.py` and `lidarlearn-evaluate`."""
     with tempfile.TemporaryDirectory() as folder:
-        entry_point.run(_evaluate_as_chosen, "evaluate", lambda: _add_data_of_checkpoint(sys.argv, Path(folder)))
+        entry_point.run(_evaluate_as_chosen, "evaluate", lambda: add_data(sys.argv, Path(folder)))
 
 
 @dataclass(frozen=True)
@@ -74,10 +71,10 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
         UserError: the data, the checkpoint, a trajectory or a setting is not as it should be.
     """
     _seed(config.seed)
-    with open_dict(config):
-        config.device = _device(config.device)
+    resolve_device(config)
     run_folder = Path(config.run_dir)
     methods = _methods(config)
+    networks = {} if config.trajectories else describe_networks(config, methods)
     layout: TableLayout | None = instantiate(config.table, _convert_="all")
     data: DataSet = instantiate(config.data)
     data.prepare(data.test_sequences)
@@ -85,10 +82,13 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     if not sequences:
         raise UserError('data.test_sequences is empty\n  change: data.test_sequences=["..."]')
     write_run_description(run_folder, config)
-    protocol = evaluation_protocol(config, data_name, methods, sequences)
+    protocol = evaluation_protocol(config, data_name, networks, sequences)
     poses: dict[str, dict[str, Tensor]] = {}
     scores: list[Score] = []
-    results = _foreign(config, sequences) if config.trajectories else _own(config, methods, sequences, run_folder)
+    if config.trajectories:
+        results = _foreign(config, sequences)
+    else:
+        results = _own(config, methods, networks, sequences, run_folder)
     try:
         for row, T_world_lidar in results:
             scores.append(row)
@@ -106,13 +106,17 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
 
 
 def _own(
-    config: DictConfig, methods: Series[Method], sequences: Mapping[str, Sequence], run_folder: Path
+    config: DictConfig,
+    methods: Series[Method],
+    networks: Mapping[str, Mapping[str, Any]],
+    sequences: Mapping[str, Sequence],
+    run_folder: Path,
 ) -> Iterator[tuple[Score, Tensor]]:
     """Run every method on every sequence, unless the run folder holds that run, and score what they export."""
     code = code_digest()
     with RunProgress() as progress:
         for method in methods:
-            own = {**method_settings(config, method), "code": code}
+            own = {**method_settings(config, method, networks), "code": code}
             for sequence in sequences.values():
                 export = Export(run_folder / "trajectories" / str(method), sequence.name)
                 settings = {"scans": sequence.fingerprint, **own}
@@ -129,7 +133,7 @@ def _own(
                 T_world_lidar, summary = read_export(export, sequence)
                 speed, health = summary["frames_per_second"], summary["health"]
                 progress.line(
-                    f"{method!s:<16} {sequence.name:<12} {len(sequence):>5} scans  {speed:6.1f} frames/s  "
+                    f"{method!s:<16} {sequence.name:<12} {len(sequence):>5} scans  {speed:6.1f} scans/s  "
                     f"{health['flagged']} flagged{'  (found in the run folder)' if found == settings else ''}"
                 )
                 yield score(str(method), T_world_lidar, sequence, speed, health), T_world_lidar
@@ -170,10 +174,18 @@ def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
 
 
 def _evaluate_as_chosen(config: DictConfig) -> None:
-    name = HydraConfig.get().runtime.choices["data"]
-    if name == _DATA_OF_CHECKPOINT:
-        name = load_checkpoint(Path(config.ckpt))["hyper_parameters"]["trained_on"]["data_name"]
-    evaluate(config, name)
+    _require_use_of_checkpoint(config)
+    evaluate(config, chosen_data(config))
+
+
+def _require_use_of_checkpoint(config: DictConfig) -> None:
+    """Raise a `UserError` where `ckpt=...` gives neither a network nor the data."""
+    used = {config.networks.get(method.initialization) for method in _methods(config)}
+    if config.ckpt is not None and config.ckpt not in used and HydraConfig.get().runtime.choices["data"] != OPTION:
+        raise UserError(
+            f"ckpt={config.ckpt}: no method runs this network\n"
+            f"  change: networks.posenet={config.ckpt} where an experiment names another, or methods=[posenet,...]"
+        )
 
 
 def _methods(config: DictConfig) -> list[Method]:
@@ -181,23 +193,7 @@ def _methods(config: DictConfig) -> list[Method]:
     if names is None:
         names = _WITH_NETWORK if config.ckpt else _WITHOUT_NETWORK
     names = [str(name) for name in ([names] if isinstance(names, str) else names)]
-    methods = [configured_method(config, name) for name in names]
-    for method in () if config.trajectories else methods:
-        network = method.initialization
-        if network in config.networks and config.networks[network] is None:
-            setting = "ckpt" if network == "posenet" else f"networks.{network}"
-            raise UserError(f"{method}: a trained network is needed\n  change: {setting}=RUN/checkpoints/best.ckpt")
-    return methods
-
-
-def _device(name: str) -> str:
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and not torch.cuda.is_available():
-        raise UserError("device=cuda: torch finds no CUDA device\n  change: device=auto or device=cpu")
-    if name not in ("cpu", "cuda"):
-        raise UserError(f"device={name}: there is no such device\n  change: device=auto, cpu or cuda")
-    return name
+    return [configured_method(config, name) for name in names]
 
 
 def _seed(seed: int) -> None:
@@ -220,26 +216,3 @@ def _report(run_folder: Path, protocol: dict[str, Any], evaluation: Evaluation, 
         writer.add_text("results", (run_folder / "results.md").read_text())
     print_tables(report_tables(protocol["data"], scores, trained_on, layout))
     print(f"results: {run_folder / 'results.md'}  plots: {run_folder / 'plots'}")
-
-
-def _add_data_of_checkpoint(arguments: list[str], folder: Path) -> None:
-    """Let `ckpt=...` without `data=...` choose the data the checkpoint was trained on.
-
-    Its config becomes one more option of the group `data`, so every override of a setting works on it as on others.
-    """
-    given = {override.split("=", 1)[0].lstrip("+"): override for override in arguments[1:] if "=" in override}
-    if "ckpt" not in given or "data" in given:
-        return
-    try:
-        path = OverridesParser.create().parse_override(given["ckpt"]).value()
-    except OverrideParseException:
-        return  # composing the configuration will say what is wrong
-    if path is None:
-        return
-    if not isinstance(path, str):
-        raise UserError(f"{given['ckpt']}: each checkpoint may come with data of its own\n  change: add data=...")
-    data = load_checkpoint(Path(path))["hyper_parameters"]["trained_on"]["data"]
-    require_trusted(data)
-    (folder / "data").mkdir()
-    OmegaConf.save(OmegaConf.create(data), folder / "data" / f"{_DATA_OF_CHECKPOINT}.yaml")
-    arguments += [f"data={_DATA_OF_CHECKPOINT}", f"hydra.searchpath=[file://{folder}]"]

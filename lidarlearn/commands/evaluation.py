@@ -13,6 +13,7 @@ from rich.progress import Progress
 
 from lidarlearn.commands import entry_point
 from lidarlearn.commands.compare import compare
+from lidarlearn.commands.device import resolve_device
 from lidarlearn.commands.run_folder import write_run_description
 from lidarlearn.data.sequence import DataSet
 from lidarlearn.errors import UserError
@@ -49,6 +50,7 @@ def measure_convergence(config: DictConfig) -> None:
     Raises:
         UserError: the data or a setting is not as it should be.
     """
+    resolve_device(config)
     unknown = [name for name in config.backends if name not in config.odometry]
     if unknown or not config.backends:
         raise UserError(f"backends={unknown}: choose among {', '.join(config.odometry)}")

@@ -1,7 +1,6 @@
 """What a result was made with: the settings behind each trajectory, and the protocol that its table carries."""
 
-from collections.abc import Mapping
-from collections.abc import Sequence as Series
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,26 +8,48 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 import lidarlearn
+from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.run_folder import git_revision
 from lidarlearn.data.sequence import Sequence
+from lidarlearn.errors import UserError
 from lidarlearn.evaluation.methods import Method
 from lidarlearn.training.checkpoints import load_checkpoint, sha256
 
 
-def method_settings(config: DictConfig, method: Method) -> dict[str, Any]:
-    """All of the configuration that a method's result depends on, beside the scans."""
+def describe_networks(config: DictConfig, methods: Iterable[Method]) -> dict[str, dict[str, Any]]:
+    """What to tell about the checkpoint of each network that methods use: its path, its hash, what it was trained on.
+
+    Raises:
+        UserError: checkpoints are not given, or not there; all of them are named.
+        CheckpointError: a file is no checkpoint.
+    """
+    used = dict.fromkeys(m.initialization for m in methods if m.initialization in config.networks)
+    missing = [_remedy(name, config.networks[name]) for name in used if not _is_file(config.networks[name])]
+    if missing:
+        raise UserError("\n".join(missing))
+    return {name: _checkpoint(Path(config.networks[name])) for name in used}
+
+
+def method_settings(config: DictConfig, method: Method, networks: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """All of the configuration that a method's result depends on, beside the scans.
+
+    Args:
+        config: composed from `configs/evaluate.yaml`.
+        method: one of the methods.
+        networks: see `describe_networks`.
+    """
     settings: dict[str, Any] = {"deskew": config.data.deskew, "seed": config.seed, "device": config.device}
     if method.initialization in config.baseline:
         parts = {"baseline": config.baseline[method.initialization]}
     else:
-        own = "posenet" if method.initialization in config.networks else method.initialization
+        own = "posenet" if method.initialization in networks else method.initialization
         parts = {"initialization": config.initialization[own]}
         if method.backend is not None:
             parts |= {"odometry": config.odometry[method.backend], "pipeline": config.pipeline}
     settings |= {name: OmegaConf.to_container(part, resolve=True) for name, part in parts.items()}
-    if method.initialization in config.networks:  # what counts is what the file holds, not where it lies
+    if method.initialization in networks:  # what counts is what the file holds, not where it lies
         settings["initialization"].pop("network")
-        settings["network"] = sha256(Path(config.networks[method.initialization]))
+        settings["network"] = networks[method.initialization]["sha256"]
     return settings
 
 
@@ -39,12 +60,10 @@ def differing_settings(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> s
 
 
 def evaluation_protocol(
-    config: DictConfig, data_name: str, methods: Series[Method], sequences: Mapping[str, Sequence]
+    config: DictConfig, data_name: str, networks: Mapping[str, Mapping[str, Any]], sequences: Mapping[str, Sequence]
 ) -> dict[str, Any]:
     """Everything that two results must have in common to be comparable, and what they were made with."""
     data = config.data
-    used = dict.fromkeys(m.initialization for m in methods if m.initialization in config.networks)
-    networks = {} if config.trajectories else {name: _checkpoint(config.networks[name]) for name in used}
     return {
         "data": data_name,
         "sequences": list(sequences),
@@ -52,9 +71,9 @@ def evaluation_protocol(
         "max_frames": data.max_frames,
         "beam_correction_deg": data.beam_correction_deg,
         "deskew": data.deskew,
-        "trajectory_frame": "the data set's reference frame (KITTI odometry: left camera)",
-        "checkpoint": networks.pop("posenet", None),
-        "networks": networks,
+        "trajectory_frame": ", ".join(dict.fromkeys(sequence.reference_frame for sequence in sequences.values())),
+        "checkpoint": networks.get("posenet"),
+        "networks": {name: network for name, network in networks.items() if name != "posenet"},
         "lidarlearn": lidarlearn.__version__,
         "git": git_revision(),
         "torch": torch.__version__,
@@ -63,11 +82,26 @@ def evaluation_protocol(
     }
 
 
-def _checkpoint(path: str) -> dict[str, Any]:
-    trained_on = load_checkpoint(Path(path))["hyper_parameters"]["trained_on"]
+def _is_file(path: str | None) -> bool:
+    return path is not None and Path(path).is_file()
+
+
+def _remedy(network: str, path: str | None) -> str:
+    """How to come by the checkpoint of a network."""
+    seen = f"networks.{network}: a trained network is needed" if path is None else f"networks.{network}: no file {path}"
+    setting = "ckpt" if network == "posenet" and path is None else f"networks.{network}"
+    remedy = f"{seen}\n  change: {setting}=RUN/checkpoints/best.ckpt"
+    experiment = f"network/{Path(path or '').parent.parent.name}"  # trains into outputs/networks/<name>/checkpoints
+    if (config_directory() / "experiment" / f"{experiment}.yaml").is_file():
+        remedy += f", or train it: python train.py experiment={experiment}"
+    return remedy
+
+
+def _checkpoint(path: Path) -> dict[str, Any]:
+    trained_on = load_checkpoint(path)["hyper_parameters"]["trained_on"]
     return {
-        "path": path,
-        "sha256": sha256(Path(path)),
+        "path": str(path),
+        "sha256": sha256(path),
         "trained_on": {
             "data": trained_on["data_name"],
             "train_sequences": trained_on["data"]["train_sequences"],

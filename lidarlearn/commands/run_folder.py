@@ -13,6 +13,7 @@ _SOURCE = Path(__file__).resolve().parent
 def git_revision() -> str:
     """Commit of the code that runs, marked "-modified" where files differ from it; "unknown" outside of a clone."""
     try:
+        _git("ls-files", "--error-unmatch", __file__)  # a clone of this code, not one that it was installed within
         commit = _git("rev-parse", "HEAD")
         return f"{commit}-modified" if _git("status", "--porcelain", "--untracked-files=no") else commit
     except (OSError, subprocess.CalledProcessError):

@@ -3,6 +3,9 @@
 import os
 import shlex
 import string
+import sys
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +16,24 @@ from omegaconf import DictConfig, OmegaConf
 
 import lidarlearn
 from lidarlearn.commands import entry_point
+from lidarlearn.commands.checkpoint_options import chosen_data
+from lidarlearn.commands.device import resolve_device
+from lidarlearn.commands.resume import add_settings, require_resumable, settings_to_keep
 from lidarlearn.commands.run_folder import git_revision, write_run_description
 from lidarlearn.data.datamodule import OdometryDataModule
 from lidarlearn.errors import UserError
-from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.module import PoseNetModule
 from lidarlearn.training.parts import build
 from lidarlearn.training.quiet import quiet
 
+_PRECISIONS = ("None", "32-true", "32", "bf16-mixed", "bf16", "16-mixed", "16")
 _PLAIN_CHARACTERS = frozenset(string.ascii_letters + string.digits + "/._-:+")
 
 
 def main() -> None:
     """Entry point of `train.py` and `lidarlearn-train`."""
-    entry_point.run(lambda config: _train_and_say_what_next(config), "train")
+    with tempfile.TemporaryDirectory() as folder:
+        entry_point.run(_train_and_say_what_next, "train", lambda: add_settings(sys.argv, Path(folder)))
 
 
 def train(config: DictConfig, data_name: str) -> Path:
@@ -44,11 +51,15 @@ def train(config: DictConfig, data_name: str) -> Path:
     """
     quiet()
     seed_everything(config.seed, workers=True, verbose=False)
+    resolve_device(config)
+    _require_workable(config)
     run_folder = Path(config.run_dir)
+    if os.environ.get("LOCAL_RANK", "0") == "0":  # the other processes come when the first has begun
+        _require_free(run_folder, config.ckpt)
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     module = build_module(config, datamodule, data_name)
     if config.ckpt is not None:
-        _check_resumable(Path(config.ckpt), module, config.trainer.max_epochs)
+        require_resumable(Path(config.ckpt), module, config.trainer.max_epochs)
     trainer: Trainer = instantiate(config.trainer)
     if trainer.is_global_zero:
         write_run_description(run_folder, config)
@@ -57,21 +68,64 @@ def train(config: DictConfig, data_name: str) -> Path:
     return best if best.exists() else best.with_name("last.ckpt")
 
 
-def evaluate_command(checkpoint: Path) -> str:
-    """The command that evaluates a checkpoint, as it can be pasted into a shell."""
+def evaluate_command(checkpoint: Path, overrides: Sequence[str] = ()) -> str:
+    """The command that evaluates a checkpoint, as it can be pasted into a shell.
+
+    Args:
+        checkpoint: the file.
+        overrides: of its training; where the data lie is told anew, since a checkpoint does not say.
+    """
     path = str(checkpoint.relative_to(Path.cwd()) if checkpoint.is_relative_to(Path.cwd()) else checkpoint)
     if not _PLAIN_CHARACTERS.issuperset(path):
         path = '"' + path.replace('"', r"\"") + '"'  # for Hydra's grammar; the shell's quotes come around it
     program = "python evaluate.py" if Path("evaluate.py").is_file() else "lidarlearn-evaluate"
-    return f"{program} {shlex.quote(f'ckpt={path}')}"
+    arguments = [f"ckpt={path}", *(override for override in overrides if override.startswith("data.root="))]
+    return f"{program} {shlex.join(arguments)}"
 
 
 def _train_and_say_what_next(config: DictConfig) -> None:
-    checkpoint = train(config, HydraConfig.get().runtime.choices["data"]).resolve()
+    checkpoint = train(config, chosen_data(config)).resolve()
     first_process = os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
     if first_process and checkpoint.exists():
         print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
-        print(f"next:       {evaluate_command(checkpoint)}")
+        print(f"next:       {evaluate_command(checkpoint, HydraConfig.get().overrides.task)}")
+
+
+def _require_workable(config: DictConfig) -> None:
+    """Raise a `UserError` where settings do not go together, before hours are spent on data."""
+    trainer = config.trainer
+    if config.scheduler not in config.schedulers:
+        raise UserError(f"scheduler={config.scheduler}: choose one of {', '.join(config.schedulers)}")
+    if str(trainer.precision) not in _PRECISIONS:
+        raise UserError(
+            f"trainer.precision={trainer.precision}: scans need more than 16 bits, and poses no more than 32\n"
+            f"  change: trainer.precision to one of {', '.join(_PRECISIONS)}"
+        )
+    if trainer.gradient_clip_val and "16" in str(trainer.precision) and config.optimizer.get("fused"):
+        raise UserError(
+            f"trainer.gradient_clip_val={trainer.gradient_clip_val} with trainer.precision={trainer.precision}: "
+            "a fused optimizer clips no gradients of 16 bits\n  change: optimizer.fused=false"
+        )
+    by_steps = config.schedulers[config.scheduler].get("total_steps", 0) is None
+    if by_steps and trainer.max_epochs == -1 and trainer.max_steps == -1:
+        raise UserError(
+            f"scheduler={config.scheduler} goes by the length of the training, and trainer.max_epochs=-1 has no end\n"
+            "  change: trainer.max_epochs, or scheduler=step or constant"
+        )
+    if not trainer.logger and "learning_rate" in config.callbacks:
+        raise UserError("trainer.logger=false: nothing takes the learning rate\n  change: add ~callbacks.learning_rate")
+
+
+def _require_free(run_folder: Path, resumed: str | None) -> None:
+    """Raise a `UserError` where a run folder holds another training: curves and checkpoints would mix."""
+    folder = run_folder / "checkpoints"
+    found = sorted(folder.glob("*.ckpt"))
+    if found and (resumed is None or Path(resumed).resolve().parent != folder.resolve()):
+        raise UserError(
+            f"{run_folder} holds the checkpoints of another training\n"
+            f"  change: hydra.run.dir to another folder (hydra.sweep.dir or subdir with -m), or delete this one, "
+            f"or ckpt={folder / 'last.ckpt'} to go on with it"
+        )
 
 
 def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: str) -> PoseNetModule:
@@ -91,11 +145,12 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
 
     p = datamodule.projection
     trained_on = {
-        "data": plain("data"),
+        "data": {key: value for key, value in plain("data").items() if key != "root"},
         "data_name": data_name,
         "loss": config.loss["_target_"].rpartition(".")[2],
         "git": git_revision(),
         "lidarlearn": lidarlearn.__version__,
+        "settings": settings_to_keep(config),
         "projection": {
             "height": p.height,
             "width": p.width,
@@ -104,21 +159,5 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
         },
     }
     parts = {node: plain(node) for node in ("model", "loss", "optimizer")}
-    if config.scheduler not in config.schedulers:
-        raise UserError(f"scheduler={config.scheduler}: choose one of {', '.join(config.schedulers)}")
     parts["scheduler"] = plain("schedulers")[config.scheduler]
-    return build(plain("module"), **parts, trained_on=trained_on)
-
-
-def _check_resumable(path: Path, module: PoseNetModule, max_epochs: int | None) -> None:
-    """Raise a `UserError` where a checkpoint cannot be continued with this configuration."""
-    checkpoint = load_checkpoint(path)
-    for part in ("model", "loss"):
-        was, now = checkpoint["hyper_parameters"][part], module.hparams[part]
-        if was != now:
-            raise UserError(
-                f"ckpt={path} was trained with {part} {was}\n  this run has {now}\n  change: one of the two"
-            )
-    done = checkpoint["epoch"] + 1
-    if max_epochs is not None and 0 <= max_epochs <= done:
-        raise UserError(f"ckpt={path} has already seen {done} epochs\n  change: trainer.max_epochs to more than that")
+    return build(plain("module"), PoseNetModule, **parts, trained_on=trained_on)

@@ -119,7 +119,9 @@ class OdometryDataModule(LightningDataModule):
             shuffle=shuffle,
             drop_last=drop_last,
             num_workers=self.num_workers,
-            persistent_workers=self.num_workers > 0,
+            # of training only until the epoch ends: new ones begin with the main process' random numbers, which a
+            # resumed training takes up
+            persistent_workers=self.num_workers > 0 and not shuffle,
             pin_memory=torch.cuda.is_available(),
         )
 

@@ -16,7 +16,7 @@ from lidarlearn.evaluation.tables import Table
 from lidarlearn.metrics.kitti import SegmentAverage
 
 # Two results are comparable where these agree, and the scans of the sequences that they share.
-_PROTOCOL = ("beam_correction_deg", "deskew", "max_frames", "trajectory_frame")
+_PROTOCOL = ("beam_correction_deg", "deskew", "max_frames")
 
 Settings = dict[str, Any]  # dotted keys and plain values
 
@@ -57,7 +57,7 @@ class Group:
         """Data and protocol in a line."""
         protocol = self.runs[0].protocol
         data = ", ".join(dict.fromkeys(str(run.protocol.get("data")) for run in self.runs))
-        return f"{data}: " + ", ".join(f"{key} {json.dumps(protocol.get(key))}" for key in _PROTOCOL[:-1])
+        return f"{data}: " + ", ".join(f"{key} {json.dumps(protocol.get(key))}" for key in _PROTOCOL)
 
     def tables(self, layout: TableLayout | None = None) -> list[Table]:
         """The same tables as of a single evaluation."""

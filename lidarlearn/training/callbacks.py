@@ -18,6 +18,21 @@ from lidarlearn.training.module import PoseNetModule
 _IMAGE_ROWS = 192  # images are enlarged to about so many rows: beams are few and pages are high
 
 
+class EventLogger(TensorBoardLogger):
+    """TensorBoard's events, directly in the run folder, where `config.yaml` tells all hyper-parameters.
+
+    Args:
+        save_dir: the folder.
+    """
+
+    def __init__(self, save_dir: str) -> None:
+        super().__init__(save_dir, name="", version="", default_hp_metric=False)
+
+    def save(self) -> None:
+        """Write what is there, and no hparams.yaml, which would be empty."""
+        self.experiment.flush()
+
+
 class InputImages(Callback):
     """Images of the first held-out pair: range and normals of its reference, and how well the target falls onto it.
 

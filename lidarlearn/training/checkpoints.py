@@ -9,7 +9,10 @@ import torch
 
 from lidarlearn.errors import UserError
 
+# What each level of a checkpoint holds, among other things.
 _NEEDED = ("module", "hyper_parameters", "state_dict")
+_PARTS = ("model", "loss", "optimizer", "scheduler", "trained_on")
+_TOLD = ("data", "data_name", "loss", "git", "projection")
 
 
 class CheckpointError(UserError):
@@ -42,8 +45,11 @@ def load_checkpoint(path: Path, map_location: torch.device | str = "cpu") -> dic
     except (RuntimeError, EOFError, OSError) as error:
         reason = next(iter(str(error).splitlines()), "it ends too early")
         raise CheckpointError(path, f"is damaged: {reason}") from error
-    if not isinstance(checkpoint, dict) or any(key not in checkpoint for key in _NEEDED):
-        raise CheckpointError(path, "was not written by lidarlearn's training.")
+    level = checkpoint
+    for key, needed in (("hyper_parameters", _NEEDED), ("trained_on", _PARTS), ("", _TOLD)):
+        if not isinstance(level, dict) or any(name not in level for name in needed):
+            raise CheckpointError(path, "was not written by lidarlearn's training.")
+        level = level.get(key)
     return checkpoint
 
 

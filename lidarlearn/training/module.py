@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
-from torch import Tensor
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
 
 from lidarlearn.data.pairs import Pair
 from lidarlearn.data.sequence import Sequence
@@ -31,9 +33,10 @@ class PoseNetModule(LightningModule):
         loss: what it minimizes.
         optimizer: takes the parameters.
         scheduler: takes the optimizer; steps once an epoch.
-        trained_on: what to tell about a checkpoint, for people and for `evaluate.py`: "data" (the data set's config),
-            "data_name", "loss", "git", "lidarlearn", and "projection" (height, width, fov_up_deg, fov_down_deg of the
-            network's image).
+        trained_on: what to tell about a checkpoint, for people, for `evaluate.py` and for a training that goes on:
+            "data" (the data set's config, without the place where it lies), "data_name", "loss", "git", "lidarlearn",
+            "projection" (height, width, fov_up_deg, fov_down_deg of the network's image), and "settings" (see
+            `lidarlearn.commands.resume`).
     """
 
     predicted_drives: list[PredictedDrive]
@@ -49,9 +52,8 @@ class PoseNetModule(LightningModule):
         super().__init__()
         self.save_hyperparameters(logger=False)
         self.projection = SphericalProjection(**trained_on["projection"])
-        self.trained_on = trained_on
-        self.model = build(model)
-        self.loss = build(loss)
+        self.model = build(model, nn.Module)
+        self.loss = build(loss, nn.Module)
         self.predicted_drives = []
         self._predictions: list[list[tuple[Tensor, Tensor]]] = []
         self._val_losses: list[Tensor] = []
@@ -67,13 +69,19 @@ class PoseNetModule(LightningModule):
             UntrustedTargetError: it names classes that are not ours.
         """
         checkpoint = load_checkpoint(Path(checkpoint_path), map_location)
-        module = build({**checkpoint["hyper_parameters"], "_target_": checkpoint["module"]})
+        module = build({**checkpoint["hyper_parameters"], "_target_": checkpoint["module"]}, PoseNetModule)
         module.load_state_dict(checkpoint["state_dict"])
         return module.to(map_location).eval()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Note the class, which Lightning leaves out."""
+        """Note what Lightning leaves out: the class, and where the stream of random numbers has got to."""
         checkpoint["module"] = f"{type(self).__module__}.{type(self).__qualname__}"
+        checkpoint["random_state"] = torch.get_rng_state()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Go on in the stream of random numbers, so that a resumed training sees the batches of an unbroken one."""
+        if "random_state" in checkpoint:
+            torch.set_rng_state(checkpoint["random_state"].cpu())
 
     @abstractmethod
     def compute_loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
@@ -140,12 +148,12 @@ class PoseNetModule(LightningModule):
 
         A schedule that asks for `total_steps` goes by steps, others by epochs.
         """
-        optimizer = build(self.hparams["optimizer"], params=self.parameters())
+        optimizer = build(self.hparams["optimizer"], Optimizer, params=self.parameters())
         schedule = dict(self.hparams["scheduler"])
         interval = "step" if "total_steps" in schedule else "epoch"
         if interval == "step" and schedule["total_steps"] is None:
             schedule["total_steps"] = int(self.trainer.estimated_stepping_batches)
-        scheduler = build(schedule, optimizer=optimizer)
+        scheduler = build(schedule, LRScheduler, optimizer=optimizer)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": interval}}
 
     def _loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:

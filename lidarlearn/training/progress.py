@@ -26,7 +26,7 @@ class ProgressLines(ProgressBar):
         super().__init__()
         self.seconds_between_lines = seconds_between_lines
         self._enabled = True
-        self._loss = float("nan")
+        self._loss = torch.tensor(float("nan"))
         self._epoch_started = self._fit_started = self._last_shown = 0.0
         self._first_epoch = 0
 
@@ -46,25 +46,28 @@ class ProgressLines(ProgressBar):
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the epoch's clock."""
         self._epoch_started = self._last_shown = time.monotonic()
-        self._loss = float("nan")
+        self._loss = torch.tensor(float("nan"))
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Move the bar."""
-        loss = float(outputs["loss"] if isinstance(outputs, dict) else outputs)
+        # a number only where it is shown: to ask for it is to wait for the device
+        loss = (outputs["loss"] if isinstance(outputs, dict) else outputs).detach()
         self._loss = loss if batch_idx == 0 else 0.95 * self._loss + 0.05 * loss
         terminal = sys.stdout.isatty()
         ends = batch_idx + 1 >= trainer.num_training_batches and not terminal  # the epoch's own line follows
         if not ends and time.monotonic() - self._last_shown >= (0.1 if terminal else self.seconds_between_lines):
             self._last_shown = time.monotonic()
             share = (batch_idx + 1) / max(1, trainer.num_training_batches)
-            self._show(f"{self._head(trainer, share)}  loss {self._loss:.4g}  {self._left(trainer, share)}", terminal)
+            self._show(
+                f"{self._head(trainer, share)}  loss {float(self._loss):.4g}  {self._left(trainer, share)}", terminal
+            )
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Leave a line with the epoch's mean loss and, if it was validated, its error."""
         metrics = trainer.callback_metrics
-        loss = float(metrics.get("train/loss_epoch", torch.tensor(self._loss)))
+        loss = float(metrics.get("train/loss_epoch", self._loss))
         took = _duration(time.monotonic() - self._epoch_started)
         parts = [self._head(trainer, 1.0), f"loss {loss:.4g}", *_errors(metrics), took, self._left(trainer, 1.0)]
         self._show("  ".join(part for part in parts if part), in_place=False)

@@ -9,12 +9,13 @@ _NOT_FOR_THE_USER = (
     r".*is smaller than the logging interval.*",  # small data sets are legitimate; epoch values are logged anyway
     r".*Checkpoint directory .* exists and is not empty.*",  # resuming into the same run folder is legitimate
     r".*You're resuming from a checkpoint that ended before the epoch ended.*",  # checkpoints are of whole epochs
-    r".*`isinstance\(treespec, LeafSpec\)` is deprecated.*",  # Lightning's own use of torch
-    r".*LeafSpec.*deprecated.*",  # likewise
+    r".*LeafSpec.*deprecated.*",  # Lightning's own use of torch
     r".*Total length of `list` across ranks is zero.*",  # one may go without validation
+    r".*It is recommended to use `self.log\('val/.*",  # every process has them from all: `PoseNetModule` gathers
+    r".*all_gather is deprecated.*",  # Lightning's own use of torch
     r".*could not find the monitored key.*",  # likewise, or a first epoch that is not validated yet
     r".*Consider setting `persistent_workers=True`.*",  # they are, where there are workers
-    r".*The dirpath has changed from.*",  # a run that resumes has a new folder, its best score starts anew
+    r".*The dirpath has changed from.*",  # a run that resumes may have a new folder
     r".*Detected call of `lr_scheduler.step\(\)` before `optimizer.step\(\)`.*",  # 16 bits skip overflowing first steps
 )
 

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -10,7 +9,7 @@ from torch import Tensor, nn
 
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.training.checkpoints import load_checkpoint
+from lidarlearn.training.checkpoints import CheckpointError, load_checkpoint
 from lidarlearn.training.parts import build
 
 _PREFIX = "model."  # of the network's entries in the state of a PoseNetModule
@@ -24,13 +23,11 @@ class TrainedNetwork:
         network: in evaluation mode; maps two vertex maps to the six parameters of `se3.from_euler`.
         projection: the image it was trained on.
         device: where it is.
-        trained_on: data, loss and versions of its training, see `PoseNetModule`.
     """
 
     network: nn.Module
     projection: SphericalProjection
     device: torch.device
-    trained_on: dict[str, Any]
 
     @torch.no_grad()
     def relative_pose(
@@ -49,9 +46,11 @@ def load_trained_network(path: Path | str, device: torch.device | str = "cpu") -
     """
     checkpoint = load_checkpoint(Path(path), map_location=device)
     parameters = checkpoint["hyper_parameters"]
-    network = build(parameters["model"])
+    network = build(parameters["model"], nn.Module)
     state = {k.removeprefix(_PREFIX): v for k, v in checkpoint["state_dict"].items() if k.startswith(_PREFIX)}
-    network.load_state_dict(state)
-    trained_on = parameters["trained_on"]
-    projection = SphericalProjection(**trained_on["projection"])
-    return TrainedNetwork(network.to(device).eval(), projection, torch.device(device), trained_on)
+    try:
+        network.load_state_dict(state)
+    except RuntimeError as error:
+        raise CheckpointError(Path(path), f"its weights do not fit its model: {error}") from error
+    projection = SphericalProjection(**parameters["trained_on"]["projection"])
+    return TrainedNetwork(network.to(device).eval(), projection, torch.device(device))

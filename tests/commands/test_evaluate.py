@@ -6,35 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from lidarlearn.commands import evaluate, evaluation
 from lidarlearn.commands.train import train
-from lidarlearn.evaluation.trajectories import write_kitti
-from tests.box_world import BoxSequence
+from tests.commands.scans import SENSOR
 from tests.training.runs import configured
 
-FRAMES = 6
-SENSOR = [
-    "data.projection.height=16", "data.projection.width=96", "data.projection.fov_up_deg=15.0",
-    "data.projection.fov_down_deg=-20.0",
-]  # fmt: skip
-
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
-
-
-@pytest.fixture(scope="module")
-def scans(tmp_path_factory):
-    """Two drives with ground truth as a folder of .npy files."""
-    root = tmp_path_factory.mktemp("scans")
-    for name in ("0", "1"):
-        drive = BoxSequence(name, FRAMES)
-        (root / name).mkdir()
-        for i, scan in enumerate(drive):
-            np.save(root / name / f"{i}.npy", scan.points.numpy())
-        write_kitti(root / name / "poses.txt", drive.T_world_lidar)
-    return root
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +95,34 @@ def test_a_network_that_is_not_there_is_named(call, tmp_path, capsys):
     with pytest.raises(SystemExit):
         call(f"hydra.run.dir={tmp_path}", "methods=[other+p_f2f]", "+networks.other=null")
     assert "networks.other=RUN/checkpoints/best.ckpt" in capsys.readouterr().err
+
+
+@pytest.fixture
+def no_data(monkeypatch):
+    """Where data are asked for, it is too late."""
+    monkeypatch.setattr(evaluate, "instantiate", lambda *_, **__: 1 / 0)
+
+
+def refused(capsys, *arguments):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(sys, "argv", ["evaluate.py", *arguments])
+        evaluate.main()
+    return capsys.readouterr().err
+
+
+def test_all_networks_that_are_not_there_are_named_before_data_are_made(no_data, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    error = refused(capsys, "experiment=paper/generalization_sim", "device=cpu")
+    for name in ("campus", "urban"):
+        assert f"networks.posenet_{name}: no file outputs/networks/simulated_{name}/checkpoints/best.ckpt" in error
+        assert f"python train.py experiment=network/simulated_{name}" in error
+
+
+def test_a_checkpoint_that_nothing_uses_is_refused(no_data, checkpoint, tmp_path, capsys):
+    error = refused(capsys, f"ckpt='{checkpoint}'", "experiment=paper/kitti", f"hydra.run.dir={tmp_path}")
+    assert f"change: networks.posenet={checkpoint}" in error
+    error = refused(capsys, f"ckpt='{checkpoint}'", "data=folder", "methods=[cv+p_f2m]", f"hydra.run.dir={tmp_path}")
+    assert "no method runs this network" in error
 
 
 TABLE = (

@@ -1,5 +1,6 @@
 """Every experiment of `configs/experiment` composes into what its command needs."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from lidarlearn.commands import entry_point
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.evaluate import configured_method
 from lidarlearn.evaluation.layout import TableLayout
@@ -36,6 +38,21 @@ def test_a_table_has_its_methods_networks_and_columns(name):
     assert set(methods) - set(layout.published) <= {"posenet_supervised"}  # beside the paper's rows
     for network in {method.partition("+")[0] for method in methods} & set(config.networks):
         assert f"network/{Path(config.networks[network]).parts[2]}" in names("network")
+
+
+@pytest.mark.parametrize("name", names("network"))
+def test_a_network_lies_where_the_tables_look_for_it(name):
+    hydra = composed("train", name).hydra
+    folder = f"outputs/networks/{Path(name).name}"
+    assert hydra.run.dir == folder == f"{hydra.sweep.dir}/{hydra.sweep.subdir}"
+
+
+def test_networks_trained_in_one_multirun_lie_there_too(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", "-m", "experiment=network/nclt,network/simulated_urban"])
+    entry_point.run(lambda config: seen.append(Path(config.run_dir)), "train")
+    assert seen == [tmp_path / "outputs/networks" / name for name in ("nclt", "simulated_urban")]
 
 
 def test_every_table_of_the_paper_has_a_stand_in():

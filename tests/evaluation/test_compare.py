@@ -12,7 +12,7 @@ from lidarlearn.evaluation.run import Export
 from lidarlearn.evaluation.score import score
 from lidarlearn.evaluation.trajectories import write_kitti
 
-PROTOCOL = {"data": "towns", "beam_correction_deg": 0.0, "deskew": False, "max_frames": None, "trajectory_frame": "x"}
+PROTOCOL = {"data": "towns", "beam_correction_deg": 0.0, "deskew": False, "max_frames": None}
 
 
 @pytest.fixture

@@ -8,13 +8,20 @@ import torch
 from lidarlearn.training.checkpoints import CheckpointError, load_checkpoint
 from lidarlearn.training.module import PoseNetModule
 from lidarlearn.training.parts import UntrustedTargetError
+from lidarlearn.training.trained_network import load_trained_network
 
 PARTS = {
     "model": {"_target_": "lidarlearn.models.posenet.PoseNet"},
     "loss": {"_target_": "lidarlearn.losses.icp.IcpLoss"},
     "optimizer": {"_target_": "torch.optim.Adam"},
     "scheduler": {"_target_": "torch.optim.lr_scheduler.StepLR", "step_size": 1},
-    "trained_on": {"projection": {"height": 16, "width": 32, "fov_up_deg": 3.0, "fov_down_deg": -24.0}},
+    "trained_on": {
+        "data": {},
+        "data_name": "x",
+        "loss": "IcpLoss",
+        "git": "unknown",
+        "projection": {"height": 16, "width": 32, "fov_up_deg": 3.0, "fov_down_deg": -24.0},
+    },
 }
 
 
@@ -52,6 +59,20 @@ def test_a_file_of_another_project(tmp_path):
     torch.save({"state_dict": {}}, tmp_path / "a.ckpt")
     with pytest.raises(CheckpointError, match="not written by lidarlearn"):
         load_checkpoint(tmp_path / "a.ckpt")
+
+
+@pytest.mark.parametrize("missing", ["model", "trained_on"])
+def test_a_checkpoint_that_does_not_tell_all(tmp_path, missing):
+    parts = {key: value for key, value in PARTS.items() if key != missing}
+    torch.save({"module": "x", "hyper_parameters": parts, "state_dict": {}}, tmp_path / "a.ckpt")
+    with pytest.raises(CheckpointError, match="not written by lidarlearn"):
+        load_checkpoint(tmp_path / "a.ckpt")
+
+
+def test_weights_of_another_model(tmp_path):
+    torch.save({"module": "x", "hyper_parameters": PARTS, "state_dict": {}}, tmp_path / "a.ckpt")
+    with pytest.raises(CheckpointError, match="weights do not fit"):
+        load_trained_network(tmp_path / "a.ckpt")
 
 
 @pytest.mark.parametrize("save", [torch.save, lambda data, path: path.write_bytes(pickle.dumps(data, protocol=2))])

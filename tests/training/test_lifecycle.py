@@ -37,7 +37,7 @@ def test_the_run_folder_is_whole(run):
     assert sorted(p.name for p in (folder / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
     assert (folder / "config.yaml").read_text().count("PoseNet") >= 1
     assert (folder / "git_revision.txt").read_text().strip()
-    assert list(folder.glob("events.out.tfevents*"))
+    assert list(folder.glob("events.out.tfevents*")) and not (folder / "hparams.yaml").exists()
 
 
 def test_the_loss_falls(run):
@@ -108,19 +108,55 @@ def test_resuming_goes_on_at_the_right_epoch(run, tmp_path):
     assert steps == list(range(EPOCHS * 8, (EPOCHS + 1) * 8))
 
 
+def test_a_folder_that_holds_another_training_is_refused(run, tmp_path):
+    folder, best, loss = run
+    for ckpt in ((), (f"ckpt={tmp_path}/elsewhere/last.ckpt",)):
+        with pytest.raises(UserError, match=r"another training(.|\n)*hydra\.run\.dir(.|\n)*ckpt=.*last\.ckpt"):
+            train(configured(folder, f"loss={loss}", *ckpt, frames=5), data_name="boxes")
+    with pytest.raises(UserError, match="already seen"):  # going on in the same folder is another matter
+        train(configured(folder, f"loss={loss}", f"ckpt={best}", "trainer.max_epochs=1", frames=5), data_name="boxes")
+
+
 def test_resuming_where_nothing_is_left_says_so(run, tmp_path):
     folder, _, loss = run
     checkpoint = folder / "checkpoints" / "last.ckpt"
     config = configured(tmp_path / "r", f"loss={loss}", f"trainer.max_epochs={EPOCHS}", f"ckpt={checkpoint}", frames=5)
-    with pytest.raises(UserError, match=r"already seen 3 epochs(.|\n)*trainer\.max_epochs"):
+    with pytest.raises(UserError, match=r"already seen 3 of 3 epochs(.|\n)*trainer\.max_epochs=6"):
         train(config, data_name="boxes")
 
 
 def test_resuming_with_another_model_says_so(run, tmp_path):
     _folder, best, loss = run
     config = configured(tmp_path / "r", f"loss={loss}", "model.backbone=resnet34", f"ckpt={best}", frames=5)
-    with pytest.raises(UserError, match="trained with model"):
+    with pytest.raises(UserError, match="another model: backbone was resnet18"):
         train(config, data_name="boxes")
+
+
+def resumed(folder, run_dir, loss, **drives):
+    """Go on for an epoch from a folder's last checkpoint, at a rate that spoils the network; the best one then."""
+    last = folder / "checkpoints" / "last.ckpt"
+    content = torch.load(last, weights_only=True)
+    for group in content["optimizer_states"][0]["param_groups"]:
+        group["lr"] = group["initial_lr"] = 1.0
+    spoilt = run_dir.parent / "checkpoints"
+    spoilt.mkdir()
+    torch.save(content, spoilt / "last.ckpt")
+    (spoilt / "best.ckpt").write_bytes((folder / "checkpoints" / "best.ckpt").read_bytes())
+    settings = (f"loss={loss}", f"trainer.max_epochs={EPOCHS + 1}", f"ckpt={spoilt}/last.ckpt", "~callbacks.images")
+    return load_checkpoint(train(configured(run_dir, *settings, frames=FRAMES, **drives), data_name="boxes"))
+
+
+def test_best_of_a_resumed_training_is_the_best_of_all(run, tmp_path):
+    folder, best, loss = run
+    after = resumed(folder, tmp_path / "resumed", loss)
+    worse = curves(tmp_path / "resumed")["val/error"][0][1]
+    assert worse > min(value for _, value in curves(folder)["val/error"])
+    assert after["epoch"] == load_checkpoint(best)["epoch"]
+
+
+def test_best_is_chosen_anew_where_other_drives_are_held_out(run, tmp_path):
+    folder, _, loss = run
+    assert resumed(folder, tmp_path / "resumed", loss, val_sequences=["1"])["epoch"] == EPOCHS
 
 
 @pytest.mark.slow

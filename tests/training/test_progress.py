@@ -6,6 +6,7 @@ from unittest.mock import create_autospec
 import pytest
 import torch
 from lightning.pytorch import LightningModule, Trainer
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from lidarlearn.training.progress import ProgressLines
 
@@ -49,6 +50,15 @@ def test_a_long_epoch_writes_lines_within(trainer, capsys):
     shares = [int(re.search(r"(\d+) %", line)[1]) for line in lines]
     assert shares == [25, 50, 75, 100, 25, 50, 75, 100]
     assert all("loss 0.5" in line for line in lines[:3])
+
+
+def test_the_device_is_waited_for_only_where_a_loss_is_shown(trainer):
+    bar, module = ProgressLines(seconds_between_lines=1000.0), LightningModule()
+    bar.on_train_start(trainer, module)
+    bar.on_train_epoch_start(trainer, module)
+    with FakeTensorMode():  # whose tensors have no values to ask for
+        for i in range(4):
+            bar.on_train_batch_end(trainer, module, {"loss": torch.ones(()) * 0.5}, None, i)
 
 
 def test_on_a_terminal_the_bar_moves_in_place(trainer, capsys, monkeypatch):

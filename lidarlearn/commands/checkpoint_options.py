@@ -1,0 +1,80 @@
+"""`ckpt=...` without `data=...`: what a checkpoint was made with, as options of the config groups.
+
+They are called `checkpoint`, e.g. `data=checkpoint`, and lie in a temporary folder on Hydra's search path, so that
+every override works on them as on the others. What they ask to build is checked: see `require_trusted`.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+
+from lidarlearn.data.sequence import DataSet
+from lidarlearn.errors import UserError
+from lidarlearn.training.checkpoints import CheckpointError, load_checkpoint
+from lidarlearn.training.parts import require_trusted
+
+OPTION = "checkpoint"
+
+
+def given_checkpoint(arguments: Sequence[str]) -> Path | None:
+    """The checkpoint on a command line, None where there is none, or `null`.
+
+    Raises:
+        UserError: there are several, for the jobs of a multirun.
+    """
+    given = next((argument for argument in reversed(arguments) if re.match(r"\+{0,2}ckpt=", argument)), "ckpt=null")
+    try:
+        path = OverridesParser.create().parse_override(given).value()
+    except OverrideParseException:
+        return None  # composing the configuration will say what is wrong
+    if path is not None and not isinstance(path, str):
+        raise UserError(
+            f"{given}: each checkpoint may come with data of its own\n"
+            "  change: one at a time; to evaluate several, add data=..."
+        )
+    return None if path is None else Path(path)
+
+
+def add_data(arguments: list[str], folder: Path) -> None:
+    """Let `ckpt=...` choose the data it was trained on, unless `data=...` or an experiment does.
+
+    Where the data lie is no matter of the checkpoint: `data.root` is that of this machine.
+
+    Args:
+        arguments: the command line; it is completed.
+        folder: an empty one for the options.
+    """
+    if any(argument.startswith(("data=", "experiment=")) for argument in arguments):
+        return
+    path = given_checkpoint(arguments)
+    if path is None:
+        return
+    trained_on = load_checkpoint(path)["hyper_parameters"]["trained_on"]
+    name, data = str(trained_on["data_name"]), trained_on["data"]
+    require_trusted(data, DataSet)
+    if not re.fullmatch(r"\w[\w-]*", name):
+        raise CheckpointError(path, f"was trained on data={name}, which is no name of a data set.")
+    settings = {key: value for key, value in data.items() if key != "root"}
+    write_option(folder, "data", {"defaults": [f"{name}@_here_", "_self_"], **settings})
+    arguments += [f"data={OPTION}", f"hydra.searchpath=[file://{folder}]"]
+
+
+def write_option(folder: Path, group: str, content: Mapping[str, Any], header: str = "") -> None:
+    """Make `checkpoint` an option of a group."""
+    path = folder / group / f"{OPTION}.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_text(header + OmegaConf.to_yaml(OmegaConf.create(dict(content))))
+
+
+def chosen_data(config: DictConfig) -> str:
+    """The name of the data of this run, as a checkpoint that was asked for its own has it."""
+    choice = HydraConfig.get().runtime.choices["data"]
+    if choice != OPTION:
+        return choice
+    return load_checkpoint(Path(config.ckpt))["hyper_parameters"]["trained_on"]["data_name"]

@@ -1,0 +1,109 @@
+"""What Hydra says about a mistaken command line, in words that help who typed it."""
+
+import re
+from collections.abc import Iterable, Sequence
+from difflib import SequenceMatcher
+from pathlib import PurePosixPath
+
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from lidarlearn.commands.configs import config_directory
+from lidarlearn.errors import UserError
+
+_OTHER_PROGRAM = {"train": "evaluate.py", "evaluate": "train.py"}
+_LEAST_LIKENESS = 0.6  # of what is worth a question
+
+
+def explanation(error: HydraException | OmegaConfBaseException, program: str, arguments: Sequence[str]) -> str:
+    """What is wrong, and what may have been meant.
+
+    Args:
+        error: raised while the configuration was composed.
+        program: name of the primary config.
+        arguments: the command line, without the program's name.
+    """
+    text = str(error).partition("\nConfig search path:")[0]
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
+        return _unknown_option(error.missing_cfg_file, error.options)
+    if re.match(r"In 'experiment/.*': Could not override", text) and program in _OTHER_PROGRAM:
+        return f"{text}\n  change: that experiment is for {_OTHER_PROGRAM[program]}"
+    key = re.search(r"Could not (?:override|delete from config\.) '(.*?)'|config group '(.*)' does not exist", text)
+    if key is not None:
+        name = key[1] or key[2]
+        return f"there is no setting or group '{name}'{_question(nearest(name, _keys(program, name, arguments)))}"
+    # the rest without its hints for programmers
+    lines = [line.strip() for line in text.splitlines()]
+    return "  ".join(line for line in lines if line and not line.startswith(("See https", "object_type=", "^")))
+
+
+def require_parts(config: DictConfig) -> None:
+    """Check that no part was replaced with the name of one: `registration.weight=huber` is not how to choose it.
+
+    Args:
+        config: of the job that runs.
+
+    Raises:
+        UserError: a string stands where a config group puts a part.
+    """
+    for choice in HydraConfig.get().runtime.choices:
+        group, at, place = str(choice).partition("@")
+        value = OmegaConf.select(config, place) if at else None
+        if isinstance(value, str):
+            name = f"{place.rpartition('.')[2]}={value}"
+            raise UserError(f"{place}: {name} is a name, not a part\n  change: {group}@{place}={value}")
+
+
+def nearest(name: str, known: Iterable[str], at_most: int = 6) -> list[str]:
+    """The names most like another, by their spelling as a whole or by as many of their last components."""
+    likeness = {other: _likeness(name, other) for other in known if other != name}
+    best = max(likeness.values(), default=0.0)
+    return [other for other, value in likeness.items() if value == best >= _LEAST_LIKENESS][:at_most]
+
+
+def _likeness(name: str, other: str) -> float:
+    mine, theirs = re.split("[./]", name), re.split("[./]", other)
+    tails = (theirs, theirs[-len(mine) :])
+    spelling = max(SequenceMatcher(None, ".".join(mine), ".".join(tail)).ratio() for tail in tails)
+    return max(spelling, 0.7 if mine[-1] == theirs[-1] else 0.0)
+
+
+def _unknown_option(path: str, options: Sequence[str]) -> str:
+    """There is no such option of a group; the options beside it, and the most similar one of the whole group."""
+    group, _, option = path.partition("/")
+    folder = config_directory() / group
+    known = sorted(p.relative_to(folder).with_suffix("").as_posix() for p in folder.rglob("*.yaml")) or list(options)
+    beside = [other for other in known if PurePosixPath(other).parent == PurePosixPath(option).parent]
+    similar = [f"{group}={other}" for other in nearest(option, known)]
+    return "\n    ".join([f"there is no {group}={option}{_question(similar)}\n  options:", *(beside or options)])
+
+
+def _question(names: Sequence[str]) -> str:
+    if len(names) == 1:
+        return f"; did you mean {names[0]}?"
+    return "".join(["; did you mean one of these?", *(f"\n    {name}" for name in names)]) if names else ""
+
+
+def _keys(program: str, mistaken: str, arguments: Sequence[str]) -> list[str]:
+    """Every key and group of a program's configuration with the rest of a command line, or with none of it."""
+    rest = [a for a in arguments if "=" in a and not a.lstrip("+~").startswith((mistaken, "-"))]
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        try:
+            config = compose(program, rest, return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException):
+            config = compose(program, return_hydra_config=True)
+    groups = [str(group) for group in config.hydra.runtime.choices if not str(group).startswith("hydra/")]
+    return list(dict.fromkeys([*_keys_below(config), *groups]))
+
+
+def _keys_below(node: DictConfig, above: str = "") -> list[str]:
+    keys = []
+    for name in map(str, node):
+        keys.append(f"{above}{name}")
+        inner = None if OmegaConf.is_missing(node, name) or OmegaConf.is_interpolation(node, name) else node[name]
+        if isinstance(inner, DictConfig) and keys[-1] != "hydra":
+            keys += _keys_below(inner, f"{keys[-1]}.")
+    return keys

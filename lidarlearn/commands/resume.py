@@ -1,0 +1,103 @@
+"""`python train.py ckpt=...`: a training goes on as it was configured, unless the command line says otherwise."""
+
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from lidarlearn.commands.checkpoint_options import OPTION, add_data, given_checkpoint, write_option
+from lidarlearn.errors import UserError
+from lidarlearn.training.checkpoints import load_checkpoint
+from lidarlearn.training.module import PoseNetModule
+from lidarlearn.training.parts import require_plain, require_trusted
+
+_FIXED = {"model": nn.Module, "loss": nn.Module, "optimizer": Optimizer, "scheduler": LRScheduler}
+
+# What decides about the result, beside the parts and the data; processors, paths and displays are those of each run.
+_OF_DATAMODULE = ("batch_size", "augmentation")
+_OF_TRAINER = (
+    "max_epochs", "min_epochs", "max_steps", "min_steps", "precision", "accumulate_grad_batches", "gradient_clip_val",
+    "gradient_clip_algorithm", "limit_train_batches", "limit_val_batches", "overfit_batches", "val_check_interval",
+    "check_val_every_n_epoch", "sync_batchnorm",
+)  # fmt: skip
+_RECIPE = f"recipe={OPTION}"  # comes after the defaults, and before experiments and the command line
+
+
+def settings_to_keep(config: DictConfig) -> dict[str, Any]:
+    """What a checkpoint has to tell for a training to go on alike, beside its parts and its data."""
+
+    def plain(node: DictConfig, keys: tuple[str, ...]) -> dict[str, Any]:
+        values = {key: node[key] for key in keys}
+        return {k: OmegaConf.to_container(v, resolve=True) if OmegaConf.is_config(v) else v for k, v in values.items()}
+
+    return {
+        **plain(config, ("seed", "scheduler")),
+        "datamodule": plain(config.datamodule, _OF_DATAMODULE),
+        "trainer": plain(config.trainer, _OF_TRAINER),
+    }
+
+
+def add_settings(arguments: list[str], folder: Path) -> None:
+    """Let `ckpt=...` choose the data, the parts and the recipe of the training that it ended.
+
+    Args:
+        arguments: the command line; it is completed.
+        folder: an empty one for the options.
+    """
+    path = given_checkpoint(arguments)
+    if path is None or _RECIPE in arguments:  # the further processes of a training inherit all
+        return
+    add_data(arguments, folder)
+    checkpoint = load_checkpoint(path)
+    parts = checkpoint["hyper_parameters"]
+    trained_on = parts["trained_on"]
+    settings = trained_on.get("settings", {})
+    for part, kind in {**_FIXED, "module": PoseNetModule}.items():
+        require_trusted({"_target_": checkpoint["module"]} if part == "module" else parts[part], kind)
+    require_plain(settings)
+    name, schedule = settings.get("scheduler", OPTION), dict(parts["scheduler"])
+    of_projection = {key: trained_on["projection"][key] for key in ("height", "width")}
+    recipe = {
+        "defaults": [*({f"override /{part}": OPTION} for part in ("model", "loss", "optimizer")), "_self_"],
+        "module": {"_target_": checkpoint["module"]},
+        "datamodule": {**of_projection, **_only(_OF_DATAMODULE, settings.get("datamodule", {}))},
+        "trainer": _only(_OF_TRAINER, settings.get("trainer", {})),
+        "scheduler": name,
+        "schedulers": {name: schedule},
+        "lr_halving_epochs": schedule.get("milestones", []),
+        **_only(("seed",), settings),
+    }
+    if "milestones" in schedule:
+        schedule["milestones"] = "${lr_halving_epochs}"  # by which the command line knows them
+    for part in ("model", "loss", "optimizer"):
+        write_option(folder, part, parts[part])
+    write_option(folder, "recipe", recipe, header="# @package _global_\n")
+    arguments += [_RECIPE, "~recipe/for_data"]
+    if not any(argument.startswith("hydra.searchpath=") for argument in arguments):
+        arguments += [f"hydra.searchpath=[file://{folder}]"]
+
+
+def require_resumable(path: Path, module: PoseNetModule, max_epochs: int | None) -> None:
+    """Raise a `UserError` where a training cannot go on from a checkpoint with this configuration."""
+    checkpoint = load_checkpoint(path)
+    for part in _FIXED:
+        was, now = checkpoint["hyper_parameters"][part], module.hparams[part]
+        changed = [key for key in {**was, **now} if was.get(key) != now.get(key)]
+        if changed:
+            differences = ", ".join(f"{key} was {was.get(key)} and is {now.get(key)}" for key in changed)
+            raise UserError(
+                f"ckpt={path} does not go on with another {part}: {differences}\n"
+                f"  change: leave the settings of the {part} to the checkpoint, or train anew, without ckpt"
+            )
+    done = checkpoint["epoch"] + 1
+    if max_epochs is not None and 0 <= max_epochs <= done:
+        raise UserError(
+            f"ckpt={path} has already seen {done} of {max_epochs} epochs\n  change: trainer.max_epochs={2 * done}"
+        )
+
+
+def _only(keys: tuple[str, ...], settings: dict[str, Any]) -> dict[str, Any]:
+    return {key: settings[key] for key in keys if key in settings}

@@ -1,0 +1,163 @@
+"""With `ckpt=...`, `train.py` and `evaluate.py` take from the checkpoint what the command line leaves out."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from lidarlearn.commands import evaluate, train
+from lidarlearn.commands.checkpoint_options import add_data
+from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.resume import add_settings, require_resumable
+from lidarlearn.errors import UserError
+from lidarlearn.training.parts import UntrustedTargetError
+from tests.commands.scans import FRAMES, SENSOR
+from tests.training.runs import curves
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
+
+RUN = (
+    "data=folder", *SENSOR, "data.train_sequences=['0']", "data.val_sequences=['1']", "data.test_sequences=['1']",
+    f"data.max_frames={FRAMES}", "datamodule.batch_size=2", "datamodule.height=16", "loss=icp", "optimizer=adamw",
+    "optimizer.lr=1e-3", "model.rotation_scale=0.2", "lr_halving_epochs=[1]", "seed=7", "trainer.limit_train_batches=2",
+    "trainer.max_epochs=2",
+)  # fmt: skip
+
+
+def run(folder, root, *arguments):
+    """Run train.py with all that is of this machine rather than of the training; the last checkpoint."""
+    own = ["device=cpu", f"data.root={root}", f"datamodule.cache_root={folder.parent}/cache",
+           "datamodule.num_workers=0", "datamodule.preparation_workers=0", "trainer.log_every_n_steps=1",
+           "~callbacks.images", "~callbacks.trajectories", f"hydra.run.dir={folder}"]  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train.py", *arguments, *own])
+        train.main()
+    return folder / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture(scope="module")
+def checkpoint(scans, tmp_path_factory):
+    """Of a finished training that is configured like no default."""
+    return run(tmp_path_factory.mktemp("runs") / "run", scans, *RUN)
+
+
+def composed(folder: Path, checkpoint: Path, *overrides: str, program: str = "train"):
+    """What a command line with `ckpt=...` composes into."""
+    shutil.rmtree(folder, ignore_errors=True)
+    arguments = ["x.py", f"ckpt={checkpoint}", "run_dir=x", *overrides]
+    (add_settings if program == "train" else add_data)(arguments, folder)
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        return compose(program, arguments[1:])
+
+
+def test_a_training_goes_on_as_it_was_configured(checkpoint, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARLEARN_DATA", "/elsewhere")
+    config = composed(tmp_path / "o", checkpoint)
+    assert config.data.root == "/elsewhere/folder"  # as on this machine
+    assert config.data.train_sequences == ["0"] and config.data.projection.fov_up_deg == 15.0
+    assert (config.datamodule.batch_size, config.datamodule.height, config.seed) == (2, 16, 7)
+    assert config.loss["_target_"].endswith("IcpLoss") and config.module["_target_"].endswith("UnsupervisedModule")
+    assert (config.optimizer["_target_"], config.optimizer.lr) == ("torch.optim.AdamW", 1e-3)
+    assert config.model.rotation_scale == 0.2
+    assert (config.scheduler, config.schedulers.step.milestones) == ("step", [1])
+    assert (config.trainer.max_epochs, config.trainer.limit_train_batches) == (2, 2)
+
+
+def test_a_schedule_without_milestones_goes_on_too(checkpoint, tmp_path):
+    content = torch.load(checkpoint, weights_only=True)
+    parts = content["hyper_parameters"]
+    parts["scheduler"] = {"_target_": "lidarlearn.training.schedules.WarmUpCosine", "total_steps": None}
+    parts["trained_on"]["settings"]["scheduler"] = "cosine"
+    torch.save(content, tmp_path / "cosine.ckpt")
+    config = composed(tmp_path / "o", tmp_path / "cosine.ckpt")
+    assert OmegaConf.to_container(config, resolve=True)["scheduler"] == "cosine"
+
+
+def test_the_command_line_and_experiments_come_after_the_checkpoint(checkpoint, tmp_path):
+    config = composed(tmp_path / "o", checkpoint, "datamodule.batch_size=3", "data.max_frames=4", "data=folder")
+    assert (config.datamodule.batch_size, config.data.max_frames) == (3, 4)
+    config = composed(tmp_path / "o", checkpoint, "experiment=network/simulated_mapping")
+    assert (config.trainer.max_epochs, config.seed, config.datamodule.batch_size) == (14, 7, 2)
+    assert config.data["_target_"].endswith("SimulatedDataSet") and len(config.data.train_sequences) == 5
+    assert config.loss["_target_"].endswith("WeightedIcpLoss")
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("optimizer.lr=1e-5", r"another optimizer: lr was 0\.001 and is 1e-05"),
+        ("optimizer=adam", r"another optimizer: _target_ was torch\.optim\.AdamW"),
+        ("lr_halving_epochs=[1,2]", r"another scheduler: milestones was \[1\]"),
+        ("scheduler=cosine", "another scheduler"),
+        ("schedulers.step.gamma=0.1", "another scheduler: gamma"),
+        ("loss=weighted_icp", "another loss: _target_"),
+        ("model.backbone=resnet34", "another model: backbone"),
+        ("trainer.max_epochs=2", r"2 of 2 epochs\n  change: trainer\.max_epochs=4"),
+    ],
+)
+def test_what_cannot_change_says_so(checkpoint, tmp_path, override, words):
+    config = composed(tmp_path / "o", checkpoint, override)
+    module = train.build_module(config, instantiate(config.datamodule), "folder")
+    with pytest.raises(UserError, match=words):
+        require_resumable(checkpoint, module, config.trainer.max_epochs)
+
+
+def test_a_finished_training_is_prolonged_by_nothing_but_more_epochs(checkpoint, scans, tmp_path):
+    run(tmp_path / "unbroken", scans, *RUN[:-1], "trainer.max_epochs=4")
+    again = run(tmp_path / "again", scans, f"ckpt={checkpoint}", "trainer.max_epochs=4")
+    whole, rest = curves(tmp_path / "unbroken"), curves(tmp_path / "again")
+    assert rest["train/loss_step"] == whole["train/loss_step"][4:]  # the very same batches
+    told = torch.load(again, weights_only=True)["hyper_parameters"]["trained_on"]
+    assert told["data_name"] == "folder" and "root" not in told["data"]
+
+
+def test_data_of_a_checkpoint_lie_where_they_do_on_this_machine(checkpoint, tmp_path, monkeypatch):
+    content = torch.load(checkpoint, weights_only=True)
+    content["hyper_parameters"]["trained_on"]["data"]["root"] = "/home/alice/data"  # as they used to be written
+    torch.save(content, tmp_path / "old.ckpt")
+    monkeypatch.setenv("LIDARLEARN_DATA", "/home/bob")
+    for name in (checkpoint, tmp_path / "old.ckpt"):
+        assert composed(tmp_path / "o", name, program="evaluate").data.root == "/home/bob/folder"
+    assert composed(tmp_path / "o", checkpoint, "data.root=/mine", program="evaluate").data.root == "/mine"
+
+
+@pytest.mark.parametrize("command", [train, evaluate])
+@pytest.mark.parametrize(
+    ("part", "evil"),
+    [
+        ("data", {"_target_": "lidarlearn.commands.run_folder._git", "_args_": ["-c", "alias.x=!touch PWNED", "x"]}),
+        ("data_name", "../../somewhere"),
+        ("data_name", "${oc.env:HOME}"),
+    ],
+)
+def test_a_checkpoint_from_elsewhere_runs_nothing(checkpoint, tmp_path, monkeypatch, capsys, command, part, evil):
+    content = torch.load(checkpoint, weights_only=True)
+    content["hyper_parameters"]["trained_on"][part] = evil
+    torch.save(content, tmp_path / "evil.ckpt")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["x.py", f"ckpt={tmp_path}/evil.ckpt", f"hydra.run.dir={tmp_path}/evil"])
+    with pytest.raises(SystemExit):
+        command.main()
+    assert "change: " in capsys.readouterr().err
+    assert not list(tmp_path.rglob("PWNED"))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"datamodule": {"augmentation": {"_target_": "lidarlearn.commands.run_folder.git_revision"}}},
+        {"trainer": {"precision": {"_target_": "lidarlearn.commands.run_folder.git_revision"}}},
+        {"seed": "${oc.env:HOME}"},
+    ],
+)
+def test_settings_of_a_checkpoint_are_plain(checkpoint, tmp_path, settings):
+    content = torch.load(checkpoint, weights_only=True)
+    content["hyper_parameters"]["trained_on"]["settings"] = settings
+    torch.save(content, tmp_path / "evil.ckpt")
+    with pytest.raises(UntrustedTargetError):
+        composed(tmp_path / "o", tmp_path / "evil.ckpt")

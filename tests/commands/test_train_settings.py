@@ -1,0 +1,35 @@
+"""Settings that do not go together are refused before data are prepared."""
+
+import pytest
+
+from lidarlearn.commands.train import train
+from lidarlearn.errors import UserError
+from tests.training.runs import configured
+
+
+@pytest.mark.parametrize(
+    ("overrides", "remedy"),
+    [
+        (["trainer.precision=bf16-mixed", "trainer.gradient_clip_val=1.0"], r"optimizer\.fused=false"),
+        (["trainer.precision=bf16-true"], r"trainer\.precision to one of .*bf16-mixed"),
+        (["trainer.logger=false"], "~callbacks.learning_rate"),
+        (["trainer.max_epochs=-1", "scheduler=cosine"], r"trainer\.max_epochs"),
+        (["scheduler=cosin"], "choose one of step, cosine, constant"),
+    ],
+)
+def test_they_say_what_to_change(tmp_path, overrides, remedy):
+    with pytest.raises(UserError, match=remedy):
+        train(configured(tmp_path / "run", *overrides), data_name="boxes")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["trainer.precision=bf16-mixed", "trainer.gradient_clip_val=1.0", "optimizer.fused=false"],
+        ["trainer.logger=false", "~callbacks.learning_rate"],
+    ],
+)
+def test_as_changed_they_work(tmp_path, overrides):
+    train(configured(tmp_path / "run", *overrides, "trainer.max_epochs=1", frames=9), data_name="boxes")
