@@ -1,0 +1,154 @@
+"""`python -m lidarlearn.evaluation map`: the maps of an evaluation, made of its trajectories and the scans."""
+
+import json
+from collections.abc import Sequence as Series
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from lidarlearn.data.progress import progress
+from lidarlearn.data.sequence import DataSet, Sequence
+from lidarlearn.errors import UserError
+from lidarlearn.evaluation.map_figure import map_figure
+from lidarlearn.evaluation.maps import MapSettings, build_map
+from lidarlearn.evaluation.plots import write_plots
+from lidarlearn.evaluation.report import print_tables
+from lidarlearn.evaluation.run import Export, read_export
+from lidarlearn.evaluation.tables import Table
+from lidarlearn.training.parts import require_trusted
+
+
+def make_maps(
+    run: Path, method: str | None, sequence: str | None, settings: MapSettings, overrides: Series[str] = ()
+) -> None:
+    """Write the map of each method and sequence of a run, a picture of each, and `maps.json`; print what they are like.
+
+    Args:
+        run: folder of an evaluation.
+        method: the only one to take; None takes all.
+        sequence: likewise.
+        settings: what goes into the maps.
+        overrides: `data.KEY=VALUE`, where the data set has moved since.
+
+    Raises:
+        UserError: the run does not have what is asked for, or its scans are gone or others.
+    """
+    config = _config_of(run, overrides)
+    exports = _chosen(run, method, sequence)
+    data: DataSet = instantiate(config.data)
+    names = sorted({export.sequence for export in exports})
+    data.prepare(names)
+    sequences = data.sequences(names)
+    rows = [_make_map(run, export, sequences[export.sequence], settings, config.data.deskew) for export in exports]
+    kept = run / "maps" / "maps.json"
+    earlier = json.loads(kept.read_text())["maps"] if kept.is_file() else []
+    others = [old for old in earlier if not any(_same(old, row) for row in rows)]
+    kept.write_text(json.dumps({"maps": others + rows}, indent=2) + "\n")
+    print_tables([_table(rows)])
+    print(f"maps: {kept.parent}")
+
+
+def _config_of(run: Path, overrides: Series[str]) -> DictConfig:
+    """The run's configuration, with the data set that it says or the overrides move."""
+    path = run / "config.yaml"
+    if not path.is_file() or not (run / "trajectories").is_dir():
+        raise UserError(
+            f"{run.absolute()}: no config.yaml, or no trajectories\n"
+            "  change: name a run folder of evaluate.py that ran methods (not one of trajectories=DIR or -m)"
+        )
+    config = OmegaConf.load(path)
+    assert isinstance(config, DictConfig)
+    if foreign := [override for override in overrides if not override.startswith("data.")]:
+        raise UserError(f"{' '.join(foreign)}: only settings of the data set can change\n  change: data.KEY=VALUE")
+    OmegaConf.set_struct(config, True)
+    config.merge_with_dotlist(list(overrides))
+    require_trusted(OmegaConf.to_container(config.data))
+    return config
+
+
+def _chosen(run: Path, method: str | None, sequence: str | None) -> list[Export]:
+    """The finished trajectories of the run that are asked for."""
+    found = [
+        Export(path.parent, path.stem)
+        for path in sorted((run / "trajectories").glob("*/*.txt"))
+        if not path.stem.endswith(".partial")
+    ]
+    found = [export for export in found if export.settings() is not None]
+    chosen = [e for e in found if method in (None, e.folder.name) and sequence in (None, e.sequence)]
+    if not chosen:
+        there = ", ".join(f"{export.folder.name} on {export.sequence}" for export in found) or "nothing"
+        interrupted = sorted((run / "trajectories").glob(f"{method or '*'}/{sequence or '*'}.partial.txt"))
+        remedy = f"finish the run, hydra.run.dir={run}" if interrupted else "--method, --sequence"
+        raise UserError(
+            f"{run.absolute()}: no finished trajectory of {method or 'any method'} on {sequence or 'any sequence'}; "
+            f"there is: {there}{', and interrupted: ' if interrupted else ''}"
+            f"{', '.join(str(path.relative_to(run)) for path in interrupted)}\n  change: {remedy}"
+        )
+    return chosen
+
+
+def _make_map(run: Path, export: Export, sequence: Sequence, settings: MapSettings, deskewed: bool) -> dict[str, Any]:
+    """Build and write one map; what `maps.json` says of it."""
+    method = export.folder.name
+    scans = (export.settings() or {}).get("scans")
+    if scans not in (None, sequence.fingerprint):
+        raise UserError(
+            f"{sequence.name}: these are not the scans of the run (files, or settings of the data, have changed)\n"
+            "  change: data.root=DIR, or run evaluate.py again"
+        )
+    T_world_lidar, _ = read_export(export, sequence)
+    used = range(0, len(sequence), settings.every)
+    with progress(f"map of {method} on {sequence.name}", len(used)) as advance:
+        built = build_map(sequence, T_world_lidar, settings, deskewed, advance)
+    path = run / "maps" / method / f"{sequence.name}.ply"
+    built.write(path)
+    figure = map_figure(
+        f"sequence {sequence.name}",
+        built.points,
+        settings.voxel_size_m,
+        {method: T_world_lidar},
+        sequence.T_world_lidar,
+    )
+    write_plots(path.parent, [(sequence.name, figure)])
+    return {
+        "method": method,
+        "sequence": sequence.name,
+        "points": len(built.points),
+        "extent_m": built.extent_m,
+        "file_bytes": path.stat().st_size,
+        "mean_plane_variance_m2": built.mean_plane_variance_m2,
+        "settings": asdict(settings),
+    }
+
+
+def _same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    return (a["method"], a["sequence"]) == (b["method"], b["sequence"])
+
+
+def _table(rows: Series[dict[str, Any]]) -> Table:
+    cells = [
+        (
+            row["method"],
+            row["sequence"],
+            f"{row['points']:,}",
+            " x ".join(f"{edge:.0f}" for edge in row["extent_m"]),
+            f"{row['file_bytes'] / 1e6:.1f}",
+            "-" if row["mean_plane_variance_m2"] is None else f"{1e4 * row['mean_plane_variance_m2']:.2f}",
+        )
+        for row in rows
+    ]
+    sharpest = frozenset({5} if len({row["sequence"] for row in rows}) == 1 else ())
+    return Table(
+        "Maps",
+        ("method", "sequence", "points", "extent [m]", "file [MB]", "MPV [cm²]"),
+        tuple(cells),
+        notes=(
+            "MPV: mean plane variance, how thick surfaces came out: the lower, the better the poses fit together. "
+            "It compares methods on the same scans, not one sequence with another.",
+        ),
+        labels=2,
+        lowest=sharpest,
+    )
