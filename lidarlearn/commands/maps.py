@@ -70,22 +70,18 @@ def _config_of(run: Path, overrides: Series[str]) -> DictConfig:
 
 
 def _chosen(run: Path, method: str | None, sequence: str | None) -> list[Export]:
-    """The finished trajectories of the run that are asked for."""
-    found = [
-        Export(path.parent, path.stem)
-        for path in sorted((run / "trajectories").glob("*/*.txt"))
-        if not path.stem.endswith(".partial")
-    ]
-    found = [export for export in found if export.settings() is not None]
+    """The trajectories of the run that are asked for, whole ones only."""
+    exports = [Export(path.parent, path.stem) for path in sorted((run / "trajectories").glob("*/*.txt"))]
+    interrupted = [export for export in exports if export.sequence.endswith(".partial")]
+    found = [export for export in exports if export not in interrupted and export.settings() is not None]
     chosen = [e for e in found if method in (None, e.folder.name) and sequence in (None, e.sequence)]
     if not chosen:
-        there = ", ".join(f"{export.folder.name} on {export.sequence}" for export in found) or "nothing"
-        interrupted = sorted((run / "trajectories").glob(f"{method or '*'}/{sequence or '*'}.partial.txt"))
-        remedy = f"finish the run, hydra.run.dir={run}" if interrupted else "--method, --sequence"
+        there = [f"{export.folder.name} on {export.sequence}" for export in found]
+        there += [f"{export.kitti.relative_to(run)} (interrupted)" for export in interrupted]
         raise UserError(
             f"{run.absolute()}: no finished trajectory of {method or 'any method'} on {sequence or 'any sequence'}; "
-            f"there is: {there}{', and interrupted: ' if interrupted else ''}"
-            f"{', '.join(str(path.relative_to(run)) for path in interrupted)}\n  change: {remedy}"
+            f"there is: {', '.join(there) or 'nothing'}\n"
+            f"  change: --method, --sequence, or finish the run: evaluate.py hydra.run.dir={run}"
         )
     return chosen
 
