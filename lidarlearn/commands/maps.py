@@ -42,13 +42,12 @@ def make_maps(
     names = sorted({export.sequence for export in exports})
     data.prepare(names)
     sequences = data.sequences(names)
-    rows = [_make_map(run, export, sequences[export.sequence], settings, config.data.deskew) for export in exports]
-    kept = run / "maps" / "maps.json"
-    earlier = json.loads(kept.read_text())["maps"] if kept.is_file() else []
-    others = [old for old in earlier if not any(_same(old, row) for row in rows)]
-    kept.write_text(json.dumps({"maps": others + rows}, indent=2) + "\n")
+    rows = []
+    for export in exports:
+        rows.append(_make_map(run, export, sequences[export.sequence], settings, config.data.deskew))
+        _keep(run / "maps" / "maps.json", rows[-1])
     print_tables([_table(rows)])
-    print(f"maps: {kept.parent}")
+    print(f"maps: {run / 'maps'}")
 
 
 def _config_of(run: Path, overrides: Series[str]) -> DictConfig:
@@ -120,8 +119,11 @@ def _make_map(run: Path, export: Export, sequence: Sequence, settings: MapSettin
     }
 
 
-def _same(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    return (a["method"], a["sequence"]) == (b["method"], b["sequence"])
+def _keep(path: Path, row: dict[str, Any]) -> None:
+    """Write what is known of a map beside the others that there are, in place of an earlier map of the same."""
+    earlier = json.loads(path.read_text())["maps"] if path.is_file() else []
+    others = [old for old in earlier if (old["method"], old["sequence"]) != (row["method"], row["sequence"])]
+    path.write_text(json.dumps({"maps": [*others, row]}, indent=2) + "\n")
 
 
 def _table(rows: Series[dict[str, Any]]) -> Table:
