@@ -183,7 +183,7 @@ def test_compare_prints_and_writes(call, no_plots, tmp_path, monkeypatch, capsys
     shutil.rmtree(tmp_path / "a")
     with pytest.raises(SystemExit) as exit_:
         evaluation.main()
-    assert exit_.value.code == 1 and "not the result of an evaluation" in capsys.readouterr().err
+    assert exit_.value.code == 1 and "results.json: no such file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("override", "remedy"), [("probe.every=100", "probe.every"), ("backends=[]", "p_f2m")])
