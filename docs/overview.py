@@ -12,9 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from lidarlearn.evaluation.map_figure import draw_map
+from lidarlearn.evaluation.maps import MapSettings, build_map
 from lidarlearn.geometry.normals import normal_map
 from lidarlearn.geometry.projection import SphericalProjection, activated
-from lidarlearn.geometry.se3 import transform
 from lidarlearn.odometry import Backend, GridSampling, LocalMap, Odometry
 from lidarlearn.odometry.initialization import ConstantVelocity
 from lidarlearn.registration.association import KdTree
@@ -39,21 +40,12 @@ def main() -> None:
 
 
 def _draw_map(axes: Axes, drive: Drive, poses: Tensor) -> None:
-    scans = {i: drive.scan(i).points[::5] for i in range(0, len(poses), 4)}
-    scans = {i: points[(points[:, 2] > -1.5) & (points[:, 2] < 8)] for i, points in scans.items()}  # without the ground
-    heights = torch.cat([points[:, 2] for points in scans.values()])
-    order = heights.argsort()
-    points = torch.cat([transform(poses[i], points) for i, points in scans.items()])[order]
-    axes.scatter(points[:, 0], points[:, 1], c=heights[order], s=0.15, cmap="viridis", linewidths=0, rasterized=True)
-    axes.plot(poses[:, 0, 3], poses[:, 1, 3], color="#d55e00", linewidth=2, label="cv+kd_f2m")
-    assert drive.T_world_lidar is not None
-    truth = drive.T_world_lidar
-    axes.plot(truth[:, 0, 3], truth[:, 1, 3], color="black", linewidth=1, linestyle="--", label="ground truth")
-    axes.set_aspect("equal")
+    settings = MapSettings(max_range_m=80)
+    points = build_map(drive, poses, settings).points
+    draw_map(axes, points, settings.voxel_size_m, {"cv+kd_f2m": poses}, drive.T_world_lidar)
     margin = torch.tensor([75.0, 25.0])
     low, high = poses[:, :2, 3].amin(0) - margin, poses[:, :2, 3].amax(0) + margin
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
-    axes.legend(loc="upper left", frameon=True)
 
 
 def _draw_image(axes: Axes, image: np.ndarray, title: str) -> None:

@@ -1,8 +1,9 @@
-"""`python -m lidarlearn.evaluation compare|convergence ...`: results side by side, and basins of convergence."""
+"""`python -m lidarlearn.evaluation compare|map|convergence ...`: what is made of results, and basins of convergence."""
 
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -14,16 +15,21 @@ from rich.progress import Progress
 from lidarlearn.commands import entry_point
 from lidarlearn.commands.compare import compare
 from lidarlearn.commands.device import resolve_device
+from lidarlearn.commands.maps import make_maps
 from lidarlearn.commands.run_folder import write_run_description
 from lidarlearn.data.sequence import DataSet
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.convergence import basin_figure, basin_tables, convergence_basin
+from lidarlearn.evaluation.maps import MapSettings
 from lidarlearn.evaluation.plots import write_plots
 from lidarlearn.evaluation.report import print_tables
 
 _USAGE = """usage:
   python -m lidarlearn.evaluation compare RUN RUN ... [--output DIR]
       results of several run folders side by side; what was not measured under the same protocol is kept apart
+  python -m lidarlearn.evaluation map RUN [--method NAME] [--sequence NAME] [--voxel 0.2] [--every 1]
+                                          [--min-range 2.5] [--max-range 60] [data.root=DIR]
+      maps of a run's drives as point clouds (.ply) and pictures, and how sharp they are, into RUN/maps
   python -m lidarlearn.evaluation convergence [data=...] [backends=[p_f2m,kd_f2m]] [KEY=VALUE ...]
       how far off an initial pose may be for a registration to succeed"""
 
@@ -33,6 +39,8 @@ def main() -> None:
     command = sys.argv[1] if len(sys.argv) > 1 else ""
     if command == "compare":
         _compare(sys.argv[2:])
+    elif command == "map":
+        _map(sys.argv[2:])
     elif command == "convergence":
         del sys.argv[1]
         entry_point.run(measure_convergence, "convergence")
@@ -81,8 +89,36 @@ def _compare(arguments: list[str]) -> None:
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder of an evaluation")
     parser.add_argument("--output", type=Path, metavar="DIR", help="where to write results.json and results.md")
     options = parser.parse_args(arguments)
+    _run(lambda: compare(options.runs, options.output))
+
+
+def _map(arguments: list[str]) -> None:
+    usual = MapSettings()
+    parser = argparse.ArgumentParser("python -m lidarlearn.evaluation map")
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of an evaluation")
+    parser.add_argument("--method", metavar="NAME", help="only this method, e.g. cv+kd_f2m; else all")
+    parser.add_argument("--sequence", metavar="NAME", help="only this sequence; else all")
+    parser.add_argument("--voxel", type=float, default=usual.voxel_size_m, metavar="M", help="a point a voxel [m]")
+    parser.add_argument("--every", type=int, default=usual.every, metavar="N", help="each n-th scan only")
+    parser.add_argument("--min-range", type=float, default=usual.min_range_m, metavar="M", help="of the points [m]")
+    parser.add_argument("--max-range", type=float, default=usual.max_range_m, metavar="M", help="of the points [m]")
+    parser.add_argument("overrides", nargs="*", metavar="data.KEY=VALUE", help="where the data is elsewhere: data.root")
+    options = parser.parse_intermixed_args(arguments)
+
+    def make() -> None:
+        settings = MapSettings(options.voxel, options.every, options.min_range, options.max_range)
+        make_maps(options.run, options.method, options.sequence, settings, options.overrides)
+
+    _run(make)
+
+
+def _run(task: Callable[[], None]) -> None:
+    """Run a command without Hydra; what the user can mend is one message."""
     try:
-        compare(options.runs, options.output)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        task()
+    except Exception as error:
+        message = entry_point.readable_message(error)
+        if message is None:
+            raise
+        print(f"error: {message}", file=sys.stderr)
         sys.exit(1)

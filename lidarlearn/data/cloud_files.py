@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import meshio
 import meshio.ply
 import numpy as np
 import torch
@@ -66,6 +67,18 @@ def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
         case _:
             raise DamagedFileError(path, f"not one of {', '.join(SUFFIXES)}")
     return _cloud(path, fields)
+
+
+def write_ply(path: Path, fields: Mapping[str, NDArray[np.float32]]) -> None:
+    """Write a cloud as .ply, binary.
+
+    Args:
+        path: the file.
+        fields: x, y, z and any more, a value for each point.
+    """
+    points = np.stack([fields[axis] for axis in "xyz"], axis=1)
+    others = {name: values for name, values in fields.items() if name not in ("x", "y", "z")}
+    meshio.ply.write(path, meshio.Mesh(points, [], point_data=others), binary=True)
 
 
 def _cloud(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:

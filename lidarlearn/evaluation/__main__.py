@@ -1,4 +1,4 @@
-"""`python -m lidarlearn.evaluation compare|convergence ...`, see `lidarlearn.commands.evaluation`."""
+"""`python -m lidarlearn.evaluation compare|map|convergence ...`, see `lidarlearn.commands.evaluation`."""
 
 from lidarlearn.commands.evaluation import main
 

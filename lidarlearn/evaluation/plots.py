@@ -58,7 +58,7 @@ def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str
     axes.set_ylim(float(lower[1]), float(upper[1]))
     axes.set_aspect("equal")
     _legend_beside(figure, axes)
-    _finish(axes, title, "x, forward at the start [m]", "y, left at the start [m]")
+    finish(axes, title, "x, forward at the start [m]", "y, left at the start [m]")
     return figure
 
 
@@ -78,8 +78,8 @@ def drift_figure(title: str, averages: Mapping[str, Mapping[int, SegmentAverage]
         right.plot(lengths, [a.rotation_deg_per_100m for a in by_length.values()], **style)
     for axes in (left, right):
         axes.set_ylim(bottom=0)
-    _finish(left, title, "segment length [m]", "translation error [%]")
-    _finish(right, "", "segment length [m]", "rotation error [deg/100 m]")
+    finish(left, title, "segment length [m]", "translation error [%]")
+    finish(right, "", "segment length [m]", "rotation error [deg/100 m]")
     _legend_beside(figure, left)
     return figure
 
@@ -101,7 +101,7 @@ def curves_figure(title: str, panels: Series[Panel]) -> Figure:
         for i, (name, curve) in enumerate(panel.curves.items()):
             axes.plot(list(curve), list(curve.values()), marker="o", markersize=4, label=name, **_line(i))
         axes.set_ylim(bottom=0)
-        _finish(axes, title if k == 0 else "", panel.x, panel.y)
+        finish(axes, title if k == 0 else "", panel.x, panel.y)
     _legend_beside(figure, row[0])
     return figure
 
@@ -127,7 +127,7 @@ def speed_figure(title: str, true_kmh: Float[Tensor, "n"], estimated_kmh: Mappin
     axes.set_xlim(edges[0], edges[-1])
     _legend_beside(figure, axes)
     beyond = " (the last bin holds all beyond)" if len(everything) and float(everything.max()) > edges[-1] else ""
-    _finish(axes, title, f"speed [km/h]{beyond}", f"share of scans [%] per {edges[1] - edges[0]:g} km/h")
+    finish(axes, title, f"speed [km/h]{beyond}", f"share of scans [%] per {edges[1] - edges[0]:g} km/h")
     return figure
 
 
@@ -150,8 +150,8 @@ def frame_error_figure(title: str, T_true: Poses, T_estimates: Mapping[str, Pose
     for axes, limit in ((upper, MAX_TRANSLATION_M), (lower, MAX_ROTATION_DEG)):
         axes.axhline(limit, color=_TRUTH, linewidth=1, linestyle=(0, (6, 3)), label="failure")
         axes.set_yscale("log")
-    _finish(upper, title, "", "translation error [m]")
-    _finish(lower, "", "scan", "rotation error [deg]")
+    finish(upper, title, "", "translation error [m]")
+    finish(lower, "", "scan", "rotation error [deg]")
     _legend_beside(figure, upper)
     return figure
 
@@ -216,7 +216,7 @@ def _line(index: int) -> dict[str, Any]:
     return {"color": _COLOURS[index % len(_COLOURS)], "linestyle": style}
 
 
-def _finish(axes: Axes, title: str, x: str, y: str) -> None:
+def finish(axes: Axes, title: str, x: str, y: str) -> None:
     """Labels and grid as all figures have them."""
     axes.set_title(title, loc="left")
     axes.set_xlabel(x)

@@ -1,4 +1,4 @@
-"""Voxel grids: integer cells of points, and one point per cell."""
+"""Voxel grids: integer cells of points, one point per cell, and sums over the points of a cell."""
 
 import functools
 import math
@@ -43,6 +43,46 @@ def grid_sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor
     begins = torch.ones_like(keys, dtype=torch.bool)
     torch.ne(keys[1:], keys[:-1], out=begins[1:])
     return lots[order[begins]]
+
+
+class VoxelSums:
+    """Sums over the points of each voxel, of points that come in parts; the memory goes by the voxels, not the points.
+
+    What is new waits, summed part by part, until it is as much as the voxels there are: merging then costs each voxel
+    no more than a few sorts, however many parts there come.
+
+    Args:
+        columns: how many values of a point are summed.
+        dtype: of the sums.
+    """
+
+    _LEAST_WAITING = 1 << 20
+
+    def __init__(self, columns: int, dtype: torch.dtype = torch.float32) -> None:
+        merged = (torch.zeros(0, 3, dtype=torch.int32), torch.zeros(0, columns, dtype=dtype))
+        self._parts: list[tuple[Tensor, Tensor]] = [merged]
+
+    def add(self, cells: Int[Tensor, "n 3"], values: Float[Tensor, "n c"]) -> None:
+        """Count in points by the voxels that hold them."""
+        self._parts.append(_summed(cells, values))
+        merged, *waiting = (len(cells) for cells, _ in self._parts)
+        if sum(waiting) > max(self._LEAST_WAITING, merged):
+            self.result()
+
+    def result(self) -> tuple[Int[Tensor, "m 3"], Float[Tensor, "m c"]]:
+        """The voxels that hold a point, ordered by x, then y, then z, and their sums."""
+        if len(self._parts) > 1:
+            cells, sums = (torch.cat(parts) for parts in zip(*self._parts, strict=True))
+            self._parts = [_summed(cells, sums)]
+        return self._parts[0]
+
+
+def _summed(cells: Int[Tensor, "n 3"], values: Float[Tensor, "n c"]) -> tuple[Int[Tensor, "m 3"], Float[Tensor, "m c"]]:
+    """The voxels, each once, and the sums of the values that stand in it."""
+    keys, voxel = torch.unique(voxel_keys(cells), return_inverse=True)
+    once = torch.empty(len(keys), 3, dtype=cells.dtype)
+    once[voxel] = cells  # all that share a voxel are alike
+    return once, values.new_zeros(len(keys), values.shape[1]).index_add_(0, voxel, values)
 
 
 def _lots(n: int, device: torch.device) -> Int[Tensor, "n"]:

@@ -6,10 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lidarlearn.commands import evaluate, evaluation
 from lidarlearn.commands.train import train
+from lidarlearn.data.cloud_files import read_cloud
 from tests.commands.scans import SENSOR
 from tests.training.runs import configured
 
@@ -189,7 +191,7 @@ def test_compare_prints_and_writes(call, no_plots, tmp_path, monkeypatch, capsys
     shutil.rmtree(tmp_path / "a")
     with pytest.raises(SystemExit) as exit_:
         evaluation.main()
-    assert exit_.value.code == 1 and "not the result of an evaluation" in capsys.readouterr().err
+    assert exit_.value.code == 1 and "results.json: no such file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("override", "remedy"), [("probe.every=100", "probe.every"), ("backends=[]", "p_f2m")])
@@ -216,6 +218,69 @@ def test_basins_of_convergence_are_measured_and_drawn(scans, tmp_path, monkeypat
         assert basin["by_offset_m"]["0.1"] > 0.9 and basin["by_offset_m"]["20.0"] < 0.2
         assert basin["by_angle_deg"]["1.0"] > 0.9 and basin["by_angle_deg"]["170.0"] < 0.6
     assert "Registrations that" in capsys.readouterr().out
+
+
+@pytest.fixture
+def maps_of(monkeypatch, capsys):
+    """Runs the command map; what it prints, and the error with which it gives up."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["x", "map", *map(str, arguments)])
+        try:
+            evaluation.main()
+        except SystemExit as exit_:
+            assert exit_.code == 1
+        printed = capsys.readouterr()
+        return printed.out, printed.err
+
+    return run
+
+
+def test_maps_are_made_of_what_a_run_has_left(call, no_plots, maps_of, scans, tmp_path):
+    run, copy = tmp_path / "run", tmp_path / "copy"
+    call(f"hydra.run.dir={run}", "methods=[cv+kd_f2m,ni]", "data.test_sequences=['0','1']")
+    printed, error = maps_of(run, "--voxel", "0.5", "--sequence", "1", "--min-range=1")
+    assert not error and "cv+kd_f2m" in printed and "MPV" in printed
+    rows = {row["method"]: row for row in json.loads((run / "maps/maps.json").read_text())["maps"]}
+    assert rows["ni"]["mean_plane_variance_m2"] > rows["cv+kd_f2m"]["mean_plane_variance_m2"] > 0
+    assert rows["cv+kd_f2m"]["extent_m"] == pytest.approx([60, 24, 7.7], abs=1)  # the hall
+    cloud, picture = (run / "maps/cv+kd_f2m" / name for name in ("1.ply", "1.png"))
+    assert cloud.stat().st_size == rows["cv+kd_f2m"]["file_bytes"] and picture.is_file()
+    assert len(read_cloud(cloud).points) == rows["cv+kd_f2m"]["points"]
+
+    shutil.copytree(scans, copy)  # another machine
+    maps_of(run, "--method=ni", "--voxel=1", f"data.root={copy}", "--sequence=1")
+    again = {row["method"]: row for row in json.loads((run / "maps/maps.json").read_text())["maps"]}
+    assert again["ni"]["settings"]["voxel_size_m"] == 1 and again["cv+kd_f2m"] == rows["cv+kd_f2m"]
+
+    for arguments, parts in (
+        (["--method=ei"], ["ei on any sequence", "cv+kd_f2m on 0, cv+kd_f2m on 1, ni on 0, ni on 1"]),
+        (["--sequence=7"], ["any method on 7", "--sequence"]),
+        (["--voxel=0"], ["--voxel"]),
+        (["data.roott=x"], ["roott"]),
+        (["seed=1"], ["data.KEY=VALUE"]),
+        ([f"data.root={tmp_path / 'gone'}"], ["gone", "data.root"]),
+    ):
+        error = maps_of(run, *arguments)[1]
+        assert error.startswith("error: ") and all(part in error for part in parts)
+
+    np.save(copy / "1" / "0.npy", np.ones((50, 3), np.float32))
+    assert "not the scans of the run" in maps_of(run, "--sequence=1", f"data.root={copy}")[1]
+
+
+def test_an_interrupted_drive_gets_no_map(call, no_plots, maps_of, tmp_path):
+    call(f"hydra.run.dir={tmp_path}", "methods=[ni]", "data.test_sequences=['0']")
+    for path in sorted((tmp_path / "trajectories/ni").iterdir()):
+        path.rename(path.with_name(path.name.replace("0.", "0.partial.")))
+    error = maps_of(tmp_path)[1]
+    assert "trajectories/ni/0.partial.txt" in error and f"hydra.run.dir={tmp_path}" in error
+
+
+def test_maps_are_made_of_runs_only_and_their_configuration_runs_no_code(maps_of, tmp_path):
+    assert "run folder of evaluate.py" in maps_of(tmp_path)[1]
+    (tmp_path / "trajectories").mkdir()
+    (tmp_path / "config.yaml").write_text("data:\n  _target_: os.system\n  command: 'false'\n")
+    assert "os.system" in maps_of(tmp_path)[1]
 
 
 def test_other_commands_say_what_there_is(monkeypatch, capsys):

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from lidarlearn.geometry.voxels import grid_sample, voxel_cells, voxel_keys
+from lidarlearn.geometry.voxels import VoxelSums, grid_sample, voxel_cells, voxel_keys
 
 
 def random_points(n: int, scale: float) -> torch.Tensor:
@@ -53,3 +53,30 @@ def test_keys_are_one_to_one_within_a_million_cells():
 def test_cells_take_any_batch_shape():
     points = random_points(24, 5.0).view(2, 3, 4, 3)
     assert torch.equal(voxel_cells(points, 0.3)[1, 2], voxel_cells(points[1, 2], 0.3))
+
+
+def test_sums_over_parts_are_those_over_everything():
+    points = random_points(3000, 3.0)
+    cells, sums = voxel_cells(points, 0.5), VoxelSums(3)
+    for part in torch.arange(3000).split(700):
+        sums.add(cells[part], points[part])
+    once, summed = sums.result()
+    occupied, voxel = cells.unique(dim=0, return_inverse=True)
+    assert torch.equal(once, occupied)
+    torch.testing.assert_close(summed, torch.zeros(len(once), 3).index_add_(0, voxel, points))
+
+
+def test_the_memory_of_sums_goes_by_the_voxels(monkeypatch):
+    monkeypatch.setattr(VoxelSums, "_LEAST_WAITING", 0)
+    points = random_points(3000, 3.0)
+    cells, sums = voxel_cells(points, 0.5), VoxelSums(1)
+    occupied = len(cells.unique(dim=0))
+    for _ in range(50):
+        sums.add(cells, torch.ones(3000, 1))
+        assert sum(len(part) for part, _ in sums._parts) <= 3 * occupied
+    assert sums.result()[1].sum() == 50 * 3000
+
+
+def test_sums_over_nothing_are_empty():
+    cells, sums = VoxelSums(2).result()
+    assert cells.shape == (0, 3) and sums.shape == (0, 2)

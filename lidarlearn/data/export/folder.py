@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-import meshio
 import numpy as np
 from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
 from lidarlearn.data.beam_correction import raise_beams
+from lidarlearn.data.cloud_files import write_ply
 from lidarlearn.data.export.drives import PERIOD_S, scans_of, timestamps_of
 from lidarlearn.data.export.kitti import matrix_row
 from lidarlearn.data.folder import Folder
@@ -47,8 +47,7 @@ def _write(path: Path, fields: dict[str, NDArray[np.float32]], bin_columns: int)
             cloud = PointCloud.from_points(list(fields.values()), tuple(fields), (np.float32,) * len(fields))
             cloud.save(path)
         case ".ply":
-            points = np.stack([fields.pop(axis) for axis in "xyz"], axis=1)
-            meshio.Mesh(points, [], point_data=dict(fields)).write(path, file_format="ply", binary=True)
+            write_ply(path, fields)
         case _:
             rows = np.zeros((len(fields["x"]), bin_columns if path.suffix == ".bin" else 4), dtype="<f4")
             for column, field in enumerate(("x", "y", "z", "intensity")):

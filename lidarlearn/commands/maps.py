@@ -1,0 +1,152 @@
+"""`python -m lidarlearn.evaluation map`: the maps of an evaluation, made of its trajectories and the scans."""
+
+import json
+from collections.abc import Sequence as Series
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, cast
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from lidarlearn.data.progress import progress
+from lidarlearn.data.sequence import DataSet, Sequence
+from lidarlearn.errors import UserError
+from lidarlearn.evaluation.map_figure import map_figure
+from lidarlearn.evaluation.maps import MapSettings, build_map
+from lidarlearn.evaluation.plots import write_plots
+from lidarlearn.evaluation.report import print_tables
+from lidarlearn.evaluation.run import Export, read_export
+from lidarlearn.evaluation.tables import Table
+from lidarlearn.training.parts import require_trusted
+
+
+def make_maps(
+    run: Path, method: str | None, sequence: str | None, settings: MapSettings, overrides: Series[str] = ()
+) -> None:
+    """Write the map of each method and sequence of a run, a picture of each, and `maps.json`; print what they are like.
+
+    Args:
+        run: folder of an evaluation.
+        method: the only one to take; None takes all.
+        sequence: likewise.
+        settings: what goes into the maps.
+        overrides: `data.KEY=VALUE`, where the data set has moved since.
+
+    Raises:
+        UserError: the run does not have what is asked for, or its scans are gone or others.
+    """
+    config = _config_of(run, overrides)
+    exports = _chosen(run, method, sequence)
+    data: DataSet = instantiate(config.data)
+    names = sorted({export.sequence for export in exports})
+    data.prepare(names)
+    sequences = data.sequences(names)
+    rows = []
+    for export in exports:
+        rows.append(_make_map(run, export, sequences[export.sequence], settings, config.data.deskew))
+        _keep(run / "maps" / "maps.json", rows[-1])
+    print_tables([_table(rows)])
+    print(f"maps: {run / 'maps'}")
+
+
+def _config_of(run: Path, overrides: Series[str]) -> DictConfig:
+    """The run's configuration, with the data set that it says or the overrides move."""
+    path = run / "config.yaml"
+    if not path.is_file() or not (run / "trajectories").is_dir():
+        raise UserError(
+            f"{run.absolute()}: no config.yaml, or no trajectories\n"
+            "  change: name a run folder of evaluate.py that ran methods (not one of trajectories=DIR or -m)"
+        )
+    config = OmegaConf.load(path)
+    assert isinstance(config, DictConfig)
+    if foreign := [override for override in overrides if not override.startswith("data.")]:
+        raise UserError(f"{' '.join(foreign)}: only settings of the data set can change\n  change: data.KEY=VALUE")
+    OmegaConf.set_struct(config, True)
+    config.merge_with_dotlist(list(overrides))
+    require_trusted(cast("dict[str, Any]", OmegaConf.to_container(config.data, resolve=True)), DataSet)
+    return config
+
+
+def _chosen(run: Path, method: str | None, sequence: str | None) -> list[Export]:
+    """The trajectories of the run that are asked for, whole ones only."""
+    exports = [Export(path.parent, path.stem) for path in sorted((run / "trajectories").glob("*/*.txt"))]
+    interrupted = [export for export in exports if export.sequence.endswith(".partial")]
+    found = [export for export in exports if export not in interrupted and export.settings() is not None]
+    chosen = [e for e in found if method in (None, e.folder.name) and sequence in (None, e.sequence)]
+    if not chosen:
+        there = [f"{export.folder.name} on {export.sequence}" for export in found]
+        there += [f"{export.kitti.relative_to(run)} (interrupted)" for export in interrupted]
+        raise UserError(
+            f"{run.absolute()}: no finished trajectory of {method or 'any method'} on {sequence or 'any sequence'}; "
+            f"there is: {', '.join(there) or 'nothing'}\n"
+            f"  change: --method, --sequence, or finish the run: evaluate.py hydra.run.dir={run}"
+        )
+    return chosen
+
+
+def _make_map(run: Path, export: Export, sequence: Sequence, settings: MapSettings, deskewed: bool) -> dict[str, Any]:
+    """Build and write one map; what `maps.json` says of it."""
+    method = export.folder.name
+    scans = (export.settings() or {}).get("scans")
+    if scans not in (None, sequence.fingerprint):
+        raise UserError(
+            f"{sequence.name}: these are not the scans of the run (files, or settings of the data, have changed)\n"
+            "  change: data.root=DIR, or run evaluate.py again"
+        )
+    T_world_lidar, _ = read_export(export, sequence)
+    used = range(0, len(sequence), settings.every)
+    with progress(f"map of {method} on {sequence.name}", len(used)) as advance:
+        built = build_map(sequence, T_world_lidar, settings, deskewed, advance)
+    path = run / "maps" / method / f"{sequence.name}.ply"
+    built.write(path)
+    figure = map_figure(
+        f"sequence {sequence.name}",
+        built.points,
+        settings.voxel_size_m,
+        {method: T_world_lidar},
+        sequence.T_world_lidar,
+    )
+    write_plots(path.parent, [(sequence.name, figure)])
+    return {
+        "method": method,
+        "sequence": sequence.name,
+        "points": len(built.points),
+        "extent_m": built.extent_m,
+        "file_bytes": path.stat().st_size,
+        "mean_plane_variance_m2": built.mean_plane_variance_m2,
+        "settings": asdict(settings),
+    }
+
+
+def _keep(path: Path, row: dict[str, Any]) -> None:
+    """Write what is known of a map beside the others that there are, in place of an earlier map of the same."""
+    earlier = json.loads(path.read_text())["maps"] if path.is_file() else []
+    others = [old for old in earlier if (old["method"], old["sequence"]) != (row["method"], row["sequence"])]
+    path.write_text(json.dumps({"maps": [*others, row]}, indent=2) + "\n")
+
+
+def _table(rows: Series[dict[str, Any]]) -> Table:
+    cells = [
+        (
+            row["method"],
+            row["sequence"],
+            f"{row['points']:,}",
+            " x ".join(f"{edge:.0f}" for edge in row["extent_m"]),
+            f"{row['file_bytes'] / 1e6:.1f}",
+            "-" if row["mean_plane_variance_m2"] is None else f"{1e4 * row['mean_plane_variance_m2']:.2f}",
+        )
+        for row in rows
+    ]
+    sharpest = frozenset({5} if len({row["sequence"] for row in rows}) == 1 else ())
+    return Table(
+        "Maps",
+        ("method", "sequence", "points", "extent [m]", "file [MB]", "MPV [cm²]"),
+        tuple(cells),
+        notes=(
+            "MPV: mean plane variance, how thick surfaces came out: the lower, the better the poses fit together. "
+            "It compares methods on the same scans, not one sequence with another.",
+        ),
+        labels=2,
+        lowest=sharpest,
+    )

@@ -1,0 +1,151 @@
+"""Maps of drives through closed-form worlds: where their surfaces are, what they keep, how sharp they come out."""
+
+from functools import cache
+
+import meshio
+import pytest
+import torch
+
+from lidarlearn.data.cloud_files import read_cloud
+from lidarlearn.data.sequence import Scan
+from lidarlearn.errors import UserError
+from lidarlearn.evaluation.maps import MapSettings, build_map, mean_plane_variance, moments
+from lidarlearn.geometry import se3
+from lidarlearn.geometry.voxels import voxel_cells
+from lidarlearn.simulation import raycasting, scenes
+from lidarlearn.simulation.drive import Drive
+from lidarlearn.simulation.sensors import hdl64
+from tests.evaluation.conftest import DriveWithoutScans
+
+FRAMES = 8
+
+
+@cache
+def corridor() -> Drive:
+    """9 m/s between walls at y = -4 m and 4 m, 1.73 m above the floor, turning; scans are distorted."""
+    path = scenes.straight_path(FRAMES + 2, 0.9, yaw_step=0.03)
+    return Drive(scenes.corridor(), poses=path, frames=FRAMES, sensor=hdl64(256), motion_distortion=True)
+
+
+def to_surface(points):
+    _, y, z = points.unbind(1)
+    return torch.stack([(y - 4).abs(), (y + 4).abs(), (z + scenes.SENSOR_HEIGHT).abs()]).amin(0)
+
+
+class Standing(DriveWithoutScans):
+    """Sees the same in every scan."""
+
+    def __init__(self, frames: int, *scans: Scan):
+        super().__init__("standing", se3.identity(frames), frames)
+        self.scans = scans
+
+    def scan(self, index: int) -> Scan:
+        return self.scans[index % len(self.scans)]
+
+
+def standing_map(sequence, **settings):
+    return build_map(sequence, sequence.T_world_lidar, MapSettings(**settings))
+
+
+def test_walls_are_where_they_are():
+    drive, advanced = corridor(), []
+    built = build_map(drive, drive.T_world_lidar, MapSettings(max_range_m=30.0), True, lambda: advanced.append(1))
+    assert len(built.points) > 5000 and len(advanced) == FRAMES
+    assert to_surface(built.points).quantile(0.99) < 0.06 and to_surface(built.points).mean() < 0.02
+    assert built.extent_m[1] == pytest.approx(8, abs=0.2)
+
+
+def test_the_motion_within_a_scan_is_compensated_where_the_run_did():
+    drive = corridor()
+    deskewed, skewed = (
+        build_map(drive, drive.T_world_lidar, MapSettings(max_range_m=30.0), on) for on in (True, False)
+    )
+    assert to_surface(skewed.points).mean() > 3 * to_surface(deskewed.points).mean()
+
+
+def test_a_voxel_has_one_point():
+    drive = corridor()
+    built = build_map(drive, drive.T_world_lidar, MapSettings(voxel_size_m=0.5, max_range_m=30.0))
+    cells = voxel_cells(built.points.double(), 0.5)
+    assert len(cells.unique(dim=0)) == len(cells) > 500
+
+
+def test_the_point_is_the_mean_with_the_mean_intensity():
+    points = torch.tensor([[5.1, 0.1, 0.3], [5.3, 0.3, 0.1], [-7.2, 0.2, 0.2]])
+    built = standing_map(Standing(1, Scan(points, None, torch.tensor([0.2, 0.6, 0.9]))), voxel_size_m=0.5)
+    torch.testing.assert_close(built.points, torch.tensor([[-7.2, 0.2, 0.2], [5.2, 0.2, 0.2]]))
+    torch.testing.assert_close(built.intensities, torch.tensor([0.9, 0.4]))
+
+
+def test_intensities_that_some_scans_lack_are_left_out():
+    points = torch.full((4, 3), 5.0)
+    mixed = Standing(2, Scan(points, None, torch.ones(4)), Scan(points))
+    assert standing_map(mixed).intensities is None
+
+
+def test_what_is_seen_again_takes_no_more_room():
+    scan = corridor().scan(0)
+    once, often = (standing_map(Standing(frames, scan)) for frames in (1, 20))
+    torch.testing.assert_close(once.points, often.points)
+
+
+def test_only_points_in_range_and_scans_in_turn_are_used():
+    near, far = (Scan(torch.tensor([[x, 0.0, 0.0], [1.0, 0, 0], [90.0, 0, 0]])) for x in (5.0, 9.0))
+    torch.testing.assert_close(standing_map(Standing(4, near, far), every=2).points, torch.tensor([[5.0, 0, 0]]))
+    assert len(standing_map(Standing(4, near, far), min_range_m=0.0, max_range_m=100.0).points) == 4
+
+
+def test_scans_without_a_point_in_range_and_poses_of_another_drive_are_refused():
+    sequence = Standing(3, Scan(torch.ones(5, 3)))
+    with pytest.raises(UserError, match="no point between"):
+        standing_map(sequence)
+    with pytest.raises(UserError, match="2 poses for 3 scans"):
+        build_map(sequence, se3.identity(2), MapSettings())
+
+
+@pytest.mark.parametrize(
+    ("setting", "remedy"),
+    [({"voxel_size_m": 0.0}, "--voxel"), ({"voxel_size_m": float("nan")}, "--voxel"), ({"every": 0}, "--every"),
+     ({"min_range_m": 70.0}, "--min-range"), ({"max_range_m": 1.0}, "--max-range")],
+)  # fmt: skip
+def test_settings_that_leave_nothing_are_refused(setting, remedy):
+    with pytest.raises(UserError, match=remedy):
+        MapSettings(**setting)
+
+
+@pytest.mark.parametrize("intensities", [None, torch.tensor([0.25, 0.75])])
+def test_other_programs_read_the_file(tmp_path, intensities):
+    points = torch.tensor([[-7.25, 1.5, 0.125], [5.0, 0.25, 2.5]])
+    path = tmp_path / "new" / "a.ply"
+    standing_map(Standing(1, Scan(points, None, intensities))).write(path)
+    assert path.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
+    cloud, mesh = read_cloud(path), meshio.read(path)
+    torch.testing.assert_close(cloud.points, points)
+    assert mesh.points.dtype == "float32" and list(mesh.point_data) == ["intensity"] * (intensities is not None)
+    by_open3d = raycasting._open3d().t.io.read_point_cloud(str(path)).point
+    torch.testing.assert_close(torch.from_numpy(by_open3d.positions.numpy()), points)
+    if intensities is not None:
+        assert cloud.intensities.tolist() == by_open3d.intensity.numpy()[:, 0].tolist() == intensities.tolist()
+
+
+def test_the_variance_of_a_noisy_plane_is_that_of_its_noise():
+    generator, sigma = torch.Generator().manual_seed(0), 0.02
+    sums = []
+    for normal in torch.randn(50, 3, generator=generator, dtype=torch.float64):
+        plane = torch.rand(2000, 3, generator=generator, dtype=torch.float64) - 0.5
+        plane[:, 2] = sigma * torch.randn(2000, generator=generator, dtype=torch.float64)
+        turned = plane @ se3.exp(torch.cat([torch.zeros(3), normal]).double())[:3, :3].mT
+        sums.append(moments(turned + normal).sum(0))
+    assert mean_plane_variance(torch.stack(sums)) == pytest.approx(sigma**2, rel=0.02)
+    assert mean_plane_variance(moments(torch.rand(9, 3)).sum(0)[None]) is None
+
+
+def test_the_worse_the_poses_the_thicker_the_surfaces():
+    drive = Drive(scenes.street(), poses=scenes.straight_path(12, 0.9), frames=12, sensor=hdl64(256))
+    noise = torch.randn(12, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noise[:, 3:] /= 20
+    variances = [
+        build_map(drive, drive.T_world_lidar @ se3.exp(scale * noise), MapSettings()).mean_plane_variance_m2
+        for scale in (0.0, 0.02, 0.05, 0.1)
+    ]
+    assert variances == sorted(variances) and variances[-1] > 1.5 * variances[0]
