@@ -133,7 +133,7 @@ class Bag:
             shown = ", ".join(map(str, topics)) or "nothing"
             raise UserError(
                 f"{self.path}: no PointCloud2 messages in it, only {shown}.\n"
-                "  change: record the sensor's point clouds (only packets: run the driver on them and record what it says)"
+                "  change: record the sensor's point clouds (of packets: run the driver on them and record its output)"
             )
         seen = "several topics hold point clouds" if wanted is None else f"no point clouds in topic {wanted}"
         raise UserError(f"{self.path}: {seen}.\n  change: data.topic to one of {', '.join(map(str, clouds))}")
