@@ -163,6 +163,7 @@ class Rosbag(DataSetOnDisk):
             report.found(name, f"{bag.path}: {size / 1e6:,.1f} MB, {bag.duration_s():.1f} s")
             for topic in bag.topics():
                 report.found(name, f"topic {topic}")
+            bag.cloud_topic(self.topic)
         except UserError as problem:
             report.missing(name, one_line(problem))
             return

@@ -2,7 +2,9 @@
 
 import json
 import pickle
+import sqlite3
 import sys
+from contextlib import closing
 from multiprocessing import get_context
 
 import numpy as np
@@ -149,6 +151,8 @@ def test_topics(tmp_path, kind):
     report = rosbag(tmp_path).check()
     assert not report.usable and "several topics hold point clouds" in details(report, "missing")
     assert "/chatter (std_msgs/msg/String, 1 messages)" in details(report, "found")
+    write_bag(tmp_path, "silence", {}, kind)
+    assert "no PointCloud2" in details(rosbag(tmp_path).check(), "missing")  # whatever else there is
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -219,6 +223,7 @@ def test_damaged_bags(tmp_path, kind, damage, capsys):
         list(rosbag(tmp_path).sequence("street"))
     with pytest.raises(SystemExit) as exited:
         main(["check", "data=rosbag", f"data.root={tmp_path}"])
+    # the first scan may be whole
     assert exited.value.code in (0, 1) and "street" in capsys.readouterr().out
 
 
@@ -230,6 +235,17 @@ def test_damaged_metadata(tmp_path, content):
         rosbag(tmp_path).sequence("street")
     (path / "metadata.yaml").unlink()
     assert len(rosbag(tmp_path).sequence("street")) == 3
+
+
+def test_a_bag_from_before_bags_held_definitions_of_their_messages(tmp_path):
+    path = write_bag(tmp_path, "street", {"/points": plain()}, "sqlite3")
+    (path / "metadata.yaml").unlink()
+    with closing(sqlite3.connect(path / "street.db3")) as connection:
+        connection.execute("DROP TABLE schema")
+        connection.execute("DROP TABLE message_definitions")
+        connection.execute("ALTER TABLE topics DROP COLUMN type_description_hash")
+        connection.commit()
+    assert [len(scan.points) for scan in rosbag(tmp_path).sequence("street")] == [200] * 3
 
 
 def test_missing_storage(tmp_path):
@@ -318,7 +334,8 @@ def in_child(sequence, index, pipe):
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_several_processes_read_one_sequence(tmp_path, kind):
     """A forked process inherits an open bag, and must not move its parent's place in the file."""
-    write_bag(tmp_path, "street", {"/points": plain(20)}, kind)
+    large = [as_rows(random_points(i, 30_000), OUSTER) for i in range(20)]  # a chunk of the file for each
+    write_bag(tmp_path, "street", {"/points": large}, kind)
     sequence = rosbag(tmp_path).sequence("street")
     expected = [first_coordinate(sequence, i) for i in range(20)]
     context = get_context("fork")
@@ -327,10 +344,10 @@ def test_several_processes_read_one_sequence(tmp_path, kind):
     for child in children:
         child.start()
     assert [first_coordinate(sequence, i) for i in range(20)] == expected
-    assert [here.recv() for _ in children] == [expected] * 2
     for child in children:
         child.join()
         assert child.exitcode == 0
+    assert [here.recv() for _ in children] == [expected] * 2
     assert [first_coordinate(pickle.loads(pickle.dumps(sequence)), i) for i in range(20)] == expected
 
 
