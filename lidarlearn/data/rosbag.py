@@ -116,11 +116,14 @@ class Rosbag(DataSetOnDisk):
         train, val, test = (there if n is None else n for n in (train_sequences, val_sequences, test_sequences))
         super().__init__(root, projection, train, val, test, max_frames, deskew, beam_correction_deg)
         self.topic = topic
+        self._sequences: dict[str, RosbagSequence] = {}
         self.max_intensity = None if max_intensity is None else float(max_intensity)
 
     def sequence(self, name: str) -> RosbagSequence:
-        """Open a bag and read through its clouds for their times."""
-        return self._open(name, self.max_frames)
+        """Open a bag and read through its clouds for their times, the first time that it is asked for."""
+        if name not in self._sequences:
+            self._sequences[name] = self._open(name, self.max_frames)
+        return self._sequences[name]
 
     def open_for_check(self, name: str) -> RosbagSequence:
         """Open a bag as if it had one cloud: reading through all takes minutes."""

@@ -102,6 +102,7 @@ def test_every_bag_of_a_folder_is_a_sequence(tmp_path):
     data = rosbag(tmp_path)
     assert data.train_sequences == data.val_sequences == data.test_sequences == ("run_9", "run_10")
     assert [len(data.sequence(name)) for name in data.names] == [3, 2]
+    assert data.sequence("run_9") is data.sequence("run_9")  # reading through a bag takes its time
     assert len(rosbag(tmp_path, max_frames=2).sequence("run_9")) == 2
     assert rosbag(tmp_path, test_sequences="run_9").test_sequences == ("run_9",)
     with pytest.raises(DataSetNotFoundError, match=r"run_9, run_10"):
