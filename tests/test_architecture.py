@@ -91,6 +91,7 @@ def test_imports_stay_light():
         "lidarlearn": {"torch", "open3d", "lightning", "hydra", "cv2", "scipy", "matplotlib"},
         "lidarlearn.odometry": {"open3d", "lightning", "hydra", "matplotlib", "torchvision"},
         "lidarlearn.data.sequence": {"open3d", "lightning", "hydra"},
+        "lidarlearn.data.rosbag": {"open3d", "lightning", "hydra", "rosbags"},
         "lidarlearn.data.simulated": {"open3d", "lightning"},
         "lidarlearn.commands.evaluate": {"open3d", "lightning", "torchvision"},
     }

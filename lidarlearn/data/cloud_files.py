@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from pypcd4 import PointCloud
 from torch import Tensor
 
+from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.scan_files import read_float32_rows
+from lidarlearn.data.sequence import Scan
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 _INTENSITY_NAMES = ("intensity", "scalar_intensity", "intensities", "reflectivity", "reflectance")
@@ -66,7 +68,10 @@ def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
             fields = _read_ply(path)
         case _:
             raise DamagedFileError(path, f"not one of {', '.join(SUFFIXES)}")
-    return _cloud(path, fields)
+    try:
+        return returns_of(fields)
+    except ValueError as error:
+        raise DamagedFileError(path, str(error)) from error
 
 
 def write_ply(path: Path, fields: Mapping[str, NDArray[np.float32]]) -> None:
@@ -81,19 +86,48 @@ def write_ply(path: Path, fields: Mapping[str, NDArray[np.float32]]) -> None:
     meshio.ply.write(path, meshio.Mesh(points, [], point_data=others), binary=True)
 
 
-def _cloud(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
-    """Names that tools use, in lower case, reduced to the ones we know, and the returns alone."""
+def returns_of(fields: Mapping[str, NDArray[Any]]) -> Cloud:
+    """The returns alone, of all fields those that matter here.
+
+    Args:
+        fields: a value per point under each of the names that tools use, in lower case.
+
+    Raises:
+        ValueError: no coordinates, or no return.
+    """
     if not {"x", "y", "z"} <= fields.keys():
-        raise DamagedFileError(path, f"no fields x, y and z, only {', '.join(fields)}")
+        raise ValueError(f"no fields x, y and z, only {', '.join(fields) or 'none'}")
     points = torch.from_numpy(np.stack([np.asarray(fields[axis], np.float32) for axis in "xyz"], axis=1))
     returned = points.isfinite().all(dim=1) & (points != 0).any(dim=1)
     if not returned.any():
-        raise DamagedFileError(path, "a scan without a single return")
+        raise ValueError("a scan without a single return")
     intensities, times = (
         next((torch.from_numpy(np.asarray(fields[n]).astype(dtype))[returned] for n in names if n in fields), None)
         for names, dtype in ((_INTENSITY_NAMES, np.float32), (_TIME_NAMES, np.float64))
     )
     return Cloud(points[returned], intensities, times, returned.nonzero()[:, 0], len(points))
+
+
+def as_scan(cloud: Cloud, beam_correction_deg: float, max_intensity: float | None) -> Scan:
+    """The scan that a file holds, with point times relative to the middle of the sweep where there are any.
+
+    Args:
+        cloud: as it stands in the file.
+        beam_correction_deg: angle by which every beam is raised.
+        max_intensity: the value of full reflectance; None leaves intensities out.
+    """
+    intensities = None
+    if max_intensity is not None and cloud.intensities is not None:
+        intensities = (cloud.intensities / max_intensity).clamp(0, 1)
+    times = None if cloud.times is None else relative_times(cloud.times)
+    return Scan(raise_beams(cloud.points, beam_correction_deg), times, intensities)
+
+
+def relative_times(times: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Times in any unit as shares of the sweep relative to its middle, within [-0.5, 0.5]; 0 where all are the same."""
+    first, last = times.min(), times.max()
+    period = torch.where(last > first, last - first, 1.0)
+    return ((times - (first + last) / 2) / period).float()
 
 
 def _columns(rows: NDArray[np.float32]) -> dict[str, NDArray[Any]]:

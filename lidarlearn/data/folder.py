@@ -15,18 +15,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data import layout
-from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.cloud_files import SUFFIXES, read_cloud
+from lidarlearn.data.cloud_files import SUFFIXES, as_scan, read_cloud
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.interpolation import interpolate_poses
+from lidarlearn.data.ground_truth import describe_ground_truth, find_ground_truth, read_ground_truth
 from lidarlearn.data.on_disk import DataSetOnDisk
-from lidarlearn.data.pose_files import read_kitti_poses, read_lines, read_numbers, read_tum_poses, start_at_identity
+from lidarlearn.data.pose_files import read_numbers
 from lidarlearn.data.scan_files import ScanFiles, holds_scans, list_scans, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
-
-_TRUTH_INSIDE = ("poses.txt", "poses.tum", "groundtruth.txt")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,14 +54,7 @@ class FolderSequence(Sequence):
     def scan(self, index: int) -> Scan:
         """Read one scan, with point times relative to the middle of the sweep where the file has any."""
         cloud = read_cloud(self.scans.path(index), self.bin_columns)
-        intensities = None
-        if self.max_intensity is not None and cloud.intensities is not None:
-            intensities = (cloud.intensities / self.max_intensity).clamp(0, 1)
-        return Scan(
-            raise_beams(cloud.points, self.beam_correction_deg),
-            times=None if cloud.times is None else relative_times(cloud.times),
-            intensities=intensities,
-        )
+        return as_scan(cloud, self.beam_correction_deg, self.max_intensity)
 
     @property
     def fingerprint(self) -> str:
@@ -130,7 +120,8 @@ class Folder(DataSetOnDisk):
         if self.deskew and read_cloud(files.path(0), self.bin_columns).times is None:
             raise UserError(f"{files.path(0)}: no point times to deskew with.\n  change: data.deskew=false")
         timestamps = _timestamps(folder, len(files))
-        poses = self._ground_truth(folder, len(files), timestamps)
+        truth = find_ground_truth(folder)
+        poses = None if truth is None else read_ground_truth(truth, len(files), timestamps)
         scans = files.first(self.max_frames)
         return FolderSequence(
             name=name,
@@ -164,64 +155,17 @@ class Folder(DataSetOnDisk):
             report.missing(name, f"scans of several kinds: {', '.join(kinds)}")
         if (folder / "times.txt").is_file():
             layout.describe_rows(report, name, folder / "times.txt", "times", len(scans))
-        truth = self._ground_truth_file(folder)
-        if truth is None:
-            report.odd(name, "no ground truth: errors will not be defined, and the supervised loss cannot be used")
-        else:
-            report.found(name, f"ground truth in {truth} with {layout.count_rows(truth)} rows")
+        describe_ground_truth(report, name, find_ground_truth(folder))
 
     def _folder(self, name: str) -> Path:
         folder = self.root / name
         return self.root if name == self.root.absolute().name and not folder.is_dir() else folder
-
-    def _ground_truth_file(self, folder: Path) -> Path | None:
-        inside = [folder / name for name in _TRUTH_INSIDE]
-        beside = [folder.absolute().with_name(f"{folder.absolute().name}{suffix}") for suffix in (".txt", ".tum")]
-        return next((path for path in inside + beside if path.is_file()), None)
-
-    def _ground_truth(
-        self, folder: Path, count: int, timestamps: Float[Tensor, "n"] | None
-    ) -> Float[Tensor, "m 4 4"] | None:
-        path = self._ground_truth_file(folder)
-        if path is None:
-            return None
-        columns = len(next(iter(read_lines(path)), "").split())
-        T_world = read_kitti_poses(path) if columns == 12 else None
-        if T_world is None:
-            stamped = read_tum_poses(path)
-            T_world = stamped.T_world_body
-            if timestamps is not None:
-                T_world = _at(path, stamped.timestamps, T_world, timestamps)
-        if len(T_world) != count:
-            raise DamagedFileError(path, f"{len(T_world)} poses for {count} scans", "give every scan a row or a time")
-        return start_at_identity(T_world)
 
 
 def find_sequences(root: Path) -> tuple[str, ...]:
     """Names of the subfolders that hold scans; the folder's own name where it holds them itself; else nothing."""
     names = tuple(folder.name for folder in subfolders(root) if holds_scans(folder, SUFFIXES))
     return names or ((root.absolute().name,) if holds_scans(root, SUFFIXES) else ())
-
-
-def relative_times(times: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Times in any unit as shares of the sweep relative to its middle, within [-0.5, 0.5]; 0 where all are the same."""
-    first, last = times.min(), times.max()
-    period = torch.where(last > first, last - first, 1.0)
-    return ((times - (first + last) / 2) / period).float()
-
-
-def _at(
-    path: Path, times: Float[Tensor, "n"], T_world: Float[Tensor, "n 4 4"], scan_times: Float[Tensor, "m"]
-) -> Float[Tensor, "m 4 4"]:
-    """Poses at the scans' times; the nearest pose may be a tenth of a second beyond an end."""
-    if len(times) < 2 or scan_times.min() < times[0] - 0.1 or scan_times.max() > times[-1] + 0.1:
-        raise DamagedFileError(
-            path,
-            f"its times ({times[0]:.3f} to {times[-1]:.3f} s) do not cover those of the scans "
-            f"({scan_times.min():.3f} to {scan_times.max():.3f} s)",
-            "use one clock in both files",
-        )
-    return interpolate_poses(times, T_world, scan_times)
 
 
 def _timestamps(folder: Path, count: int) -> Float[Tensor, "n"] | None:

@@ -132,7 +132,7 @@ def describe_unconfigured(report: LayoutReport, found: Mapping[str, ScanFiles], 
     named = set(configured)
     for name, scans in found.items():
         if name not in named:
-            report.found(name, f"{len(scans)} scans, but it is not among the configured sequences")
+            report.found(name, f"there ({len(scans)} files), but not among the configured sequences")
 
 
 def suggest_sequences(report: LayoutReport, found: Iterable[str]) -> None:

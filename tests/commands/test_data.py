@@ -6,6 +6,9 @@ import pytest
 from lidarlearn.commands.data import compose_data_set, data_groups, main
 from lidarlearn.data.sequence import DataSet
 from tests.data.writers import (
+    as_rows,
+    random_points,
+    write_bag,
     write_float32,
     write_ford_campus,
     write_kitti_360,
@@ -24,6 +27,7 @@ SPLITS = {
     "kitti_00_02-10": (ODOMETRY[:1] + ODOMETRY[2:11], ["01"]),
     "kitti_00_02-21": (ODOMETRY[:1] + ODOMETRY[2:], ["01"]),
 }
+CLOUD = as_rows(random_points(0), [(axis, "<f4") for axis in "xyz"])
 
 
 def only(name):
@@ -40,7 +44,7 @@ def run(capsys, *arguments):
 def test_every_data_set_composes_and_has_an_answer_to_an_absent_root(name, tmp_path, capsys):
     data = compose_data_set([f"data={name}"])
     assert isinstance(data, DataSet)
-    assert not set(data.val_sequences) & set(data.test_sequences) or name == "folder"
+    assert not set(data.val_sequences) & set(data.test_sequences) or name in ("folder", "rosbag")
     code, printed = run(capsys, "check", f"data={name}", f"data.root={tmp_path / 'nowhere'}")
     assert code == 1 and "no such folder" in printed and "data.root" in printed
 
@@ -75,6 +79,7 @@ def test_sequence_numbers_from_the_command_line():
         ("nclt", write_nclt, "2012-01-08"),
         ("ford_campus", write_ford_campus, "IJRR-Dataset-1"),
         ("folder", lambda root: write_float32(root / "drive" / "0.bin", [[1, 2, 3]]), "drive"),
+        ("rosbag", lambda root: write_bag(root, "drive", {"/points": [CLOUD]}), "drive"),
     ],
 )
 def test_a_whole_copy_is_usable_and_a_partial_one_is_described(tmp_path, capsys, name, write, sequence):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidarlearn.data.cloud_files import read_cloud
+from lidarlearn.data.cloud_files import read_cloud, relative_times
 from lidarlearn.data.errors import DamagedFileError
 from tests.data.writers import random_points, write_float32, write_pcd, write_ply
 
@@ -108,3 +108,10 @@ def test_genuine_ply(real_data):
     cloud = read_cloud(real_data / "hdl32_pair" / "source.ply")
     assert 60_000 < len(cloud.points) <= 69_792
     assert cloud.intensities is not None and cloud.intensities.max() == 128
+
+
+def test_relative_times_of_any_unit():
+    expected = torch.tensor([-0.5, 0.0, 0.5])
+    for times in ([0.0, 50.0, 100.0], [1.6e9, 1.6e9 + 0.05, 1.6e9 + 0.1]):
+        assert torch.allclose(relative_times(torch.tensor(times, dtype=torch.float64)), expected, atol=1e-5)
+    assert torch.equal(relative_times(torch.ones(3).double()), torch.zeros(3))

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
-import torch
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.folder import Folder, relative_times
+from lidarlearn.data.folder import Folder
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 from tests.data.test_pose_files import tum_rows
@@ -64,13 +63,6 @@ def test_deskewing_needs_point_times(tmp_path):
         folder(tmp_path, deskew=True).sequence("without")
     report = folder(tmp_path, deskew=True).check()
     assert not report.usable and "without" in details(report, "missing")
-
-
-def test_relative_times_of_any_unit():
-    expected = torch.tensor([-0.5, 0.0, 0.5])
-    for times in ([0.0, 50.0, 100.0], [1.6e9, 1.6e9 + 0.05, 1.6e9 + 0.1]):
-        assert torch.allclose(relative_times(torch.tensor(times, dtype=torch.float64)), expected, atol=1e-5)
-    assert torch.equal(relative_times(torch.ones(3).double()), torch.zeros(3))
 
 
 @pytest.mark.parametrize("name", ["drive/poses.txt", "drive/groundtruth.txt", "drive.txt"])

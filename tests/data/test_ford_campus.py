@@ -138,7 +138,7 @@ def test_further_sequences_and_gaps_are_listed(tmp_path):
     scan_file(tmp_path).unlink()
     report = ford(tmp_path).check()
     assert report.usable
-    assert "IJRR-Dataset-2 4 scans, but it is not among" in details(report, "found")
+    assert "IJRR-Dataset-2 there (4 files), but not among" in details(report, "found")
     assert "gaps in the numbering: 76" in details(report, "odd")
 
 

@@ -164,7 +164,7 @@ def test_check_lists_missing_and_further_sequences(tmp_path):
     write_kitti_odometry(tmp_path, "04")
     report = kitti(tmp_path, train_sequences=["00"], val_sequences=["00"], test_sequences=[9]).check()
     assert "00 no folder" in details(report, "missing") and "09 no folder" in details(report, "missing")
-    assert "04 5 scans, but it is not among" in details(report, "found")
+    assert "04 there (5 files), but not among" in details(report, "found")
     assert "(04)" in report.remedy
 
 

@@ -153,4 +153,4 @@ def test_the_genuine_scan(real_data):
     elevation = np.degrees(np.arctan2(points[:, 2].numpy(), points[:, :2].norm(dim=1).numpy()))
     medians = sorted(np.median(elevation[rows["laser"] == laser]) for laser in range(32))
     assert np.allclose(medians, np.linspace(-10.67, 30.67, 32), atol=0.02)
-    assert "2012-01-15 1 scans" in details(data.check(), "found")
+    assert "2012-01-15 there (1 files)" in details(data.check(), "found")

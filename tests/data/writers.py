@@ -1,11 +1,13 @@
 """Miniature data sets in the genuine on-disk formats, with the truth that went into them.
 
-Written from the formats' descriptions with numpy and scipy alone, so that a reader is never tested against itself.
+Written from the formats' descriptions with numpy and scipy alone, so that a reader is never tested against itself; the
+containers of ROS bags by the library that writes and reads them for others.
 """
 
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.io import savemat
@@ -14,6 +16,8 @@ from scipy.spatial.transform import Rotation
 
 # A camera's axes (x right, y down, z forward) in those of a LiDAR, and a lever arm: what calib.txt calls Tr.
 T_CAMERA_LIDAR = np.array([[0, -1, 0, 0.01], [0, 0, -1, -0.07], [1, 0, 0, -0.27], [0, 0, 0, 1]], dtype=np.float64)
+
+RECORDED_EVERY_NS = 100_000_000  # messages of a topic of a bag
 
 
 @dataclass(frozen=True)
@@ -216,6 +220,90 @@ def write_ford_campus(root: Path, name: str = "IJRR-Dataset-1", frames: int = 4)
         }
         savemat(folder / f"Scan{i + 75:04d}.mat", {"SCAN": content}, do_compression=True)
     return Written(points, curve(frames))
+
+
+def as_rows(points: np.ndarray, fields: list[tuple[str, str]] | np.dtype, **values: np.ndarray | float) -> np.ndarray:
+    """Points as a driver lays them out: a structured array of x, y, z and other fields."""
+    rows = np.zeros(points.shape[:-1], dtype=fields)
+    rows["x"], rows["y"], rows["z"] = np.moveaxis(points, -1, 0)
+    for name, value in values.items():
+        rows[name] = value
+    return rows
+
+
+def write_bag(
+    root: Path,
+    name: str,
+    topics: dict[str, list[np.ndarray] | list[str]],
+    kind: str = "ros1",
+    stamps: np.ndarray | None = None,
+    compression: str | None = None,
+    row_padding: int = 0,
+    start_s: float = 1.6e9,
+) -> Path:
+    """A bag by the writers of `rosbags`, with PointCloud2 messages for rows of points and String for text.
+
+    Args:
+        root: the folder in which it is written.
+        name: of the file or folder.
+        topics: messages at 10 Hz, recorded 3 ms after their stamps.
+        kind: ros1, sqlite3 or mcap.
+        stamps: times in the headers [s]; None for 10 Hz from `start_s` on.
+        compression: bz2 or lz4 of ROS 1, FILE, MESSAGE or STORAGE of ROS 2.
+        row_padding: bytes between the rows of a cloud.
+        start_s: time of the first message.
+    """
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    root.mkdir(parents=True, exist_ok=True)
+    if kind == "ros1":
+        path, serialize = root / f"{name}.bag", types.serialize_ros1
+        writer = rosbag1.Writer(path)
+        if compression:
+            writer.set_compression(rosbag1.Writer.CompressionFormat[compression.upper()])
+    else:
+        path, serialize = root / name, types.serialize_cdr
+        writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[kind.upper()])
+        if compression:
+            writer.set_compression(rosbag2.CompressionMode[compression], rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        for topic, messages in topics.items():
+            text = bool(messages) and isinstance(messages[0], str)
+            message_type = "std_msgs/msg/String" if text else "sensor_msgs/msg/PointCloud2"
+            connection = writer.add_connection(topic, message_type, typestore=types)
+            for i, content in enumerate(messages):
+                recorded_ns = round(1e9 * start_s) + RECORDED_EVERY_NS * i + 3_000_000
+                stamp_ns = round(1e9 * start_s) + 100_000_000 * i if stamps is None else round(1e9 * stamps[i])
+                message = (
+                    types.types[message_type](data=content) if text else _cloud(types, content, stamp_ns, row_padding)
+                )
+                writer.write(connection, recorded_ns, serialize(message, message_type))
+    return path
+
+
+def _cloud(types: Any, rows: np.ndarray, stamp_ns: int, row_padding: int) -> Any:
+    numbers = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+    field, header = types.types["sensor_msgs/msg/PointField"], types.types["std_msgs/msg/Header"]
+    layout = [(name, *rows.dtype.fields[name][:2]) for name in rows.dtype.names]
+    rows = np.atleast_2d(rows)
+    height, width = rows.shape
+    buffer = np.zeros((height, width * rows.itemsize + row_padding), np.uint8)
+    buffer[:, : width * rows.itemsize] = np.ascontiguousarray(rows).view(np.uint8).reshape(height, -1)
+    stamp = types.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+    sequence_number = {"seq": 0} if "seq" in header.__dataclass_fields__ else {}
+    return types.types["sensor_msgs/msg/PointCloud2"](
+        header=header(stamp=stamp, frame_id="lidar", **sequence_number),
+        height=height,
+        width=width,
+        fields=[field(name, offset, numbers[dtype.str[1:]], 1) for name, dtype, offset in layout],
+        is_bigendian=any(dtype.str[0] == ">" for _, dtype, _ in layout),
+        point_step=rows.itemsize,
+        row_step=buffer.shape[1],
+        data=buffer.reshape(-1),
+        is_dense=False,
+    )
 
 
 def write_pcd(path: Path, points: np.ndarray, times: np.ndarray, encoding: str = "binary") -> None:

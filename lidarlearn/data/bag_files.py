@@ -1,0 +1,223 @@
+"""ROS bags, read with the library `rosbags`: their topics, and the PointCloud2 messages of one of them.
+
+A bag is a file (.bag of ROS 1, a lone .db3 or .mcap of ROS 2), a folder with the metadata.yaml of ROS 2, or a folder of
+such files: the parts into which a recorder has split one recording.
+"""
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cache
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.scan_files import ScanFiles, holds_scans, list_scans, natural_key, subfolders
+from lidarlearn.errors import UserError
+
+SUFFIXES = (".bag", ".db3", ".mcap")
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+_METADATA = "metadata.yaml"
+_REPAIR = (
+    "copy or download it again, or repair what a recorder left unfinished: `rosbag reindex BAG`,"
+    " `ros2 bag reindex FOLDER`, `mcap recover FILE`"
+)
+
+
+def find_bags(root: Path) -> dict[str, Path]:
+    """The bags of a folder by name, in natural order: all in it, or it alone where it is one itself.
+
+    A bag is named like its folder, or its file without the suffix; with it where two would share a name.
+    """
+    if _is_file(root) or (root / _METADATA).is_file():
+        return {bag_name(root): root}
+    files = list_scans(root, SUFFIXES)
+    bags = [files.path(i) for i in range(len(files))]
+    bags += [f for f in subfolders(root) if (f / _METADATA).is_file() or holds_scans(f, SUFFIXES)]
+    alike = Counter(map(bag_name, bags))
+    named = {bag_name(bag) if alike[bag_name(bag)] == 1 else bag.name: bag for bag in bags}
+    return dict(sorted(named.items(), key=lambda bag: natural_key(bag[0])))
+
+
+def bag_name(path: Path) -> str:
+    """A folder's name, or a file's without its suffix."""
+    return path.stem if _is_file(path) else path.absolute().name
+
+
+def list_files(bag: Path) -> ScanFiles:
+    """The files that hold a bag's messages."""
+    if _is_file(bag):
+        return ScanFiles(bag.parent, (bag.name,), (bag.stat().st_size,))
+    return list_scans(bag, (*SUFFIXES, ".zstd"))
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag.
+
+    Args:
+        name: e.g. /os_cloud_node/points.
+        kind: type of its messages, e.g. sensor_msgs/msg/PointCloud2.
+        count: number of its messages.
+    """
+
+    name: str
+    kind: str
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.kind}, {self.count} messages)"
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a message is: its part of the bag, the time [ns] at which it was recorded, and its rank at that time."""
+
+    part: int
+    time_ns: int
+    rank: int
+
+
+class Bag:
+    """A bag, opened when it is first read: once in every process, since processes cannot share a place in a file.
+
+    All that reads it raises DamagedFileError where it is no bag or a damaged one, and UserError without the library.
+
+    Args:
+        path: of the file or folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._readers: list[Any] = []
+        self._files = ExitStack()
+        self._process = -1
+
+    def __reduce__(self) -> tuple[type["Bag"], tuple[Path]]:
+        return Bag, (self.path,)
+
+    def __del__(self) -> None:
+        self._files.close()
+
+    def topics(self) -> list[Topic]:
+        """All topics, by name."""
+        counts: Counter[tuple[str, str]] = Counter()
+        for connection in (c for reader in self._opened() for c in reader.connections):
+            counts[connection.topic, connection.msgtype] += connection.msgcount
+        return [Topic(name, kind, count) for (name, kind), count in sorted(counts.items())]
+
+    def duration_s(self) -> float:
+        """From the first to the last message of any topic [s]."""
+        readers = [reader for reader in self._opened() if reader.message_count]
+        ends = [reader.end_time for reader in readers]
+        return 1e-9 * (max(ends) - min(reader.start_time for reader in readers)) if ends else 0.0
+
+    def cloud_topic(self, wanted: str | None) -> Topic:
+        """The topic to read.
+
+        Args:
+            wanted: its name; None for the only one with point clouds.
+
+        Raises:
+            UserError: there is no such topic, or several to choose from.
+        """
+        topics = self.topics()
+        clouds = [topic for topic in topics if topic.kind == POINT_CLOUD and topic.count]
+        chosen = [topic for topic in clouds if wanted in (None, topic.name)]
+        if len(chosen) == 1:
+            return chosen[0]
+        if not clouds:
+            shown = ", ".join(map(str, topics)) or "nothing"
+            raise UserError(
+                f"{self.path}: no PointCloud2 messages in it, only {shown}.\n"
+                "  change: record the sensor's point clouds (of packets: run the driver on them and record its output)"
+            )
+        seen = "several topics hold point clouds" if wanted is None else f"no point clouds in topic {wanted}"
+        raise UserError(f"{self.path}: {seen}.\n  change: data.topic to one of {', '.join(map(str, clouds))}")
+
+    def messages(self, topic: str) -> Iterator[tuple[Place, Any]]:
+        """All PointCloud2 messages of a topic in the order of recording, each with its place."""
+        for part, reader in enumerate(self._opened()):
+            before, rank = None, 0
+            with _readable(self.path):
+                for _, time_ns, raw in reader.messages(_connections(reader, topic)) if reader.message_count else ():
+                    rank = rank + 1 if time_ns == before else 0
+                    before = time_ns
+                    yield Place(part, time_ns, rank), _decode(reader, raw)
+
+    def message(self, topic: str, place: Place) -> Any:
+        """One PointCloud2 message."""
+        reader = self._opened()[place.part]
+        with _readable(self.path):
+            there = reader.messages(_connections(reader, topic), start=place.time_ns, stop=place.time_ns + 1)
+            return _decode(reader, next(islice(there, place.rank, None))[2])
+
+    def _opened(self) -> list[Any]:
+        """Readers of the parts in the order of time."""
+        if self._process != os.getpid():
+            self._files.close()
+            with _readable(self.path), ExitStack() as files:
+                readers = [files.enter_context(_reader(path)) for path in self._parts()]
+                self._readers = sorted(readers, key=lambda reader: reader.start_time)
+                self._files, self._process = files.pop_all(), os.getpid()
+        return self._readers
+
+    def _parts(self) -> list[Path]:
+        if _is_file(self.path) or (self.path / _METADATA).is_file():
+            return [self.path]
+        files = list_scans(self.path, SUFFIXES)
+        if len(kinds := {Path(name).suffix.lower() for name in files.names}) > 1:
+            raise UserError(
+                f"{self.path}: bags of several kinds ({', '.join(sorted(kinds))}) are no parts of one recording.\n"
+                "  change: keep the parts of one recording in a folder"
+            )
+        return [files.path(i) for i in range(len(files))]
+
+
+def _is_file(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def _reader(part: Path) -> Any:
+    try:
+        from rosbags import rosbag1, rosbag2
+    except ModuleNotFoundError as error:
+        raise UserError(
+            "reading ROS bags needs the package rosbags.\n"
+            "  change: pip install 'lidarlearn[rosbag]' (in a copy of the repository: pip install -e '.[rosbag]')"
+        ) from error
+    return rosbag1.Reader(part) if part.suffix.lower() == ".bag" else rosbag2.Reader(part)
+
+
+def _connections(reader: Any, topic: str) -> list[Any]:
+    return [c for c in reader.connections if (c.topic, c.msgtype) == (topic, POINT_CLOUD)]
+
+
+def _decode(reader: Any, raw: bytes) -> Any:
+    from rosbags import rosbag1
+
+    if isinstance(reader, rosbag1.Reader):
+        return _types("ros1_noetic").deserialize_ros1(raw, POINT_CLOUD)
+    return _types("ros2_humble").deserialize_cdr(raw, POINT_CLOUD)
+
+
+@cache
+def _types(release: str) -> Any:
+    """What messages consist of: PointCloud2 is the same in all releases, and not every bag says so itself."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores(release))
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # the library's own, its assertions, those of struct, of SQLite and of decompressors
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise DamagedFileError(path, f"cannot be read as a ROS bag ({lines[0].rstrip('.')})", _REPAIR) from error

@@ -1,0 +1,204 @@
+"""ROS bags: the point clouds (sensor_msgs/PointCloud2) of ROS 1 and ROS 2 recordings, read as they are.
+
+On disk: every bag in a folder is a sequence, or the root is one bag itself; see `bag_files` for what is a bag. Beside
+it, or in its folder, there may be ground truth of the LiDAR's own poses as with `folder`: `<sequence>.tum` is
+interpolated at the scans' times. A scan's time is the one in its message's header, by convention that of its first
+point; where those do not ascend, the one at which it was recorded. Messages without points are passed over.
+"""
+
+import hashlib
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.data.bag_files import Bag, Place, Topic, bag_name, find_bags, list_files
+from lidarlearn.data.cloud_files import as_scan, returns_of
+from lidarlearn.data.errors import DamagedFileError, one_line
+from lidarlearn.data.ground_truth import describe_ground_truth, find_ground_truth, read_ground_truth
+from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.point_cloud2 import fields_of
+from lidarlearn.data.progress import tracked
+from lidarlearn.data.scan_files import ScanFiles
+from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.errors import UserError
+from lidarlearn.geometry.projection import SphericalProjection
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RosbagSequence(Sequence):
+    """The point clouds of one topic of a bag.
+
+    Args:
+        name: of the bag.
+        bag: the recording.
+        topic: the clouds' name.
+        places: where in the bag each cloud is.
+        T_world_lidar: ground truth; None where there is none.
+        timestamps: of each cloud [s].
+        max_intensity: the value of full reflectance; None leaves intensities out.
+        beam_correction_deg: angle by which every beam is raised.
+    """
+
+    name: str
+    bag: Bag
+    topic: str
+    places: tuple[Place, ...]
+    T_world_lidar: Float[Tensor, "n 4 4"] | None
+    timestamps: Float[Tensor, "n"]
+    max_intensity: float | None
+    beam_correction_deg: float
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan, with point times relative to the middle of the sweep where the points have any."""
+        message = self.bag.message(self.topic, self.places[index])
+        try:
+            cloud = returns_of(fields_of(message))
+        except ValueError as error:
+            raise DamagedFileError(self.bag.path, f"scan {index} of {self.topic}: {error}") from error
+        return as_scan(cloud, self.beam_correction_deg, self.max_intensity)
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the settings, of all times, and of the first, the middle and the last cloud."""
+        settings = (self.topic, self.max_intensity, self.beam_correction_deg, self.places)
+        digest = hashlib.sha256(repr(("Rosbag", settings)).encode())
+        digest.update(self.timestamps.numpy().tobytes())
+        for index in sorted({0, len(self) // 2, len(self) - 1}):
+            message = self.bag.message(self.topic, self.places[index])
+            digest.update(repr((message.height, message.width, message.fields)).encode() + message.data.tobytes())
+        return digest.hexdigest()
+
+
+class Rosbag(DataSetOnDisk):
+    """Recordings of ROS.
+
+    Args:
+        root: a folder of bags, or one bag.
+        projection: the image of the sensor.
+        train_sequences: names of bags; None takes all there are.
+        val_sequences: likewise.
+        test_sequences: likewise.
+        max_frames: keep only the first scans of each sequence; None keeps all.
+        deskew: whether odometries compensate the motion within a scan; only where the points carry times.
+        beam_correction_deg: angle by which every beam is raised.
+        topic: of the point clouds; None takes the only one there is.
+        max_intensity: the value of full reflectance, e.g. 255; None leaves intensities out.
+    """
+
+    title = "ROS bags"
+    source = "your own recordings: .bag of ROS 1, or folders of ROS 2 with metadata.yaml and .db3 or .mcap"
+    marker = "ROS bag and no folder of bags"
+
+    def __init__(
+        self,
+        root: str | Path,
+        projection: SphericalProjection,
+        train_sequences: Names | None = None,
+        val_sequences: Names | None = None,
+        test_sequences: Names | None = None,
+        max_frames: int | None = None,
+        deskew: bool = False,
+        beam_correction_deg: float | int = 0.0,
+        topic: str | None = None,
+        max_intensity: float | int | None = None,
+    ) -> None:
+        root = Path(root).expanduser()
+        there = tuple(find_bags(root)) or (bag_name(root),)
+        train, val, test = (there if n is None else n for n in (train_sequences, val_sequences, test_sequences))
+        super().__init__(root, projection, train, val, test, max_frames, deskew, beam_correction_deg)
+        self.topic = topic
+        self._sequences: dict[str, RosbagSequence] = {}
+        self.max_intensity = None if max_intensity is None else float(max_intensity)
+
+    def sequence(self, name: str) -> RosbagSequence:
+        """Open a bag and read through its clouds for their times, the first time that it is asked for."""
+        if name not in self._sequences:
+            self._sequences[name] = self._open(name, self.max_frames)
+        return self._sequences[name]
+
+    def open_for_check(self, name: str) -> RosbagSequence:
+        """Open a bag as if it had one cloud: reading through all takes minutes."""
+        return self._open(name, 1)
+
+    def _open(self, name: str, max_frames: int | None) -> RosbagSequence:
+        bag = self._bag(name)
+        topic = bag.cloud_topic(self.topic)
+        places, timestamps, empty = _read_times(name, bag, topic, max_frames)
+        path = find_ground_truth(bag.path, bag_name(bag.path))
+        poses = None if path is None else read_ground_truth(path, topic.count - empty, timestamps)
+        sequence = RosbagSequence(
+            name=name,
+            bag=bag,
+            topic=topic.name,
+            places=places,
+            T_world_lidar=None if poses is None else poses[: len(places)],
+            timestamps=timestamps,
+            max_intensity=self.max_intensity,
+            beam_correction_deg=self.beam_correction_deg,
+        )
+        if self.deskew and sequence.scan(0).times is None:
+            raise UserError(f"{bag.path}: no point times in {topic.name} to deskew with.\n  change: data.deskew=false")
+        return sequence
+
+    @staticmethod
+    def is_root(path: Path) -> bool:
+        """Whether it is a bag, or holds bags."""
+        return bool(find_bags(path))
+
+    def found(self) -> dict[str, ScanFiles]:
+        """All bags."""
+        return {name: list_files(path) for name, path in find_bags(self.root).items()}
+
+    def check_sequence(self, report: LayoutReport, name: str) -> None:
+        """Size, duration, topics, and ground truth."""
+        try:
+            bag = self._bag(name)
+            size = sum(list_files(bag.path).sizes)
+            report.found(name, f"{bag.path}: {size / 1e6:,.1f} MB, {bag.duration_s():.1f} s")
+            for topic in bag.topics():
+                report.found(name, f"topic {topic}")
+            bag.cloud_topic(self.topic)
+        except UserError as problem:
+            report.missing(name, one_line(problem))
+            return
+        describe_ground_truth(report, name, find_ground_truth(bag.path, bag_name(bag.path)))
+
+    def _bag(self, name: str) -> Bag:
+        bags = find_bags(self.root)
+        if name not in bags:
+            raise self.not_found(name, f"a bag called {name}")
+        return Bag(bags[name])
+
+
+def _read_times(
+    name: str, bag: Bag, topic: Topic, max_frames: int | None
+) -> tuple[tuple[Place, ...], Float[Tensor, "n"], int]:
+    """Places and times [s] of the first clouds, and how many messages without points were passed over."""
+    messages = bag.messages(topic.name)
+    if max_frames != 1:  # one is there at once
+        messages = tracked(messages, f"reading the times of {name}", min(topic.count, max_frames or topic.count))
+    places, stamps, empty = [], [], 0
+    for place, message in messages:
+        if message.width * message.height == 0:
+            empty += 1
+            continue
+        places.append(place)
+        stamps.append(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
+        if len(places) == max_frames:
+            break
+    if not places:
+        raise DamagedFileError(bag.path, f"no message of {topic.name} has points")
+    timestamps = torch.tensor(stamps, dtype=torch.float64)
+    if (timestamps.diff() <= 0).any():
+        _log.warning("%s: the times in the headers of %s do not ascend, those of recording are used", name, topic.name)
+        timestamps = 1e-9 * torch.tensor([place.time_ns for place in places], dtype=torch.float64)
+    return tuple(places), timestamps, empty

@@ -1,0 +1,379 @@
+"""Bags as the writers of `rosbags` make them, with clouds as drivers lay them out."""
+
+import json
+import pickle
+import sqlite3
+import sys
+from contextlib import closing
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+import torch
+
+from lidarlearn.commands import evaluate
+from lidarlearn.commands.data import main
+from lidarlearn.data.bag_files import find_bags
+from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.rosbag import Rosbag
+from lidarlearn.errors import UserError
+from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.simulation import scenes
+from lidarlearn.simulation.drive import Drive
+from lidarlearn.simulation.sensors import os1_64
+from tests.data.test_pose_files import tum_rows
+from tests.data.writers import as_rows, curve, kitti_rows, random_points, write_bag
+
+KINDS = ("ros1", "sqlite3", "mcap")
+PLAIN = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+# Ouster's layout: holes between the fields and after the last one, times in nanoseconds
+OUSTER = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u4", "<u2", "u1"],
+        "offsets": [0, 4, 8, 16, 20, 24, 26],
+        "itemsize": 48,
+    }
+)
+TIMES_NS = np.linspace(0, 99_000_000, 200).astype(np.uint32)
+
+
+def rosbag(root, **settings):
+    return Rosbag(root, SphericalProjection(), **settings)
+
+
+def plain(count=3, first=0):
+    return [as_rows(random_points(first + i), PLAIN) for i in range(count)]
+
+
+def details(report, level):
+    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
+
+
+@pytest.mark.parametrize(
+    ("kind", "compression"),
+    [(kind, None) for kind in KINDS]
+    + [("ros1", "bz2"), ("ros1", "lz4"), ("sqlite3", "MESSAGE"), ("sqlite3", "FILE"), ("mcap", "STORAGE")],
+)
+def test_round_trip(tmp_path, kind, compression):
+    clouds = [as_rows(random_points(i), OUSTER, intensity=100, t=TIMES_NS) for i in range(4)]
+    write_bag(tmp_path, "street", {"/points": clouds, "/chatter": ["hello"] * 4}, kind, compression=compression)
+    sequence = rosbag(tmp_path, max_intensity=200).sequence("street")
+    assert len(sequence) == 4 and sequence.T_world_lidar is None
+    for i in (3, 0, 2, 1, 2):
+        scan = sequence.scan(i)
+        assert np.array_equal(scan.points, random_points(i)) and scan.points.dtype == torch.float32
+        assert np.allclose(scan.times, np.linspace(-0.5, 0.5, 200), atol=1e-6)
+        assert (scan.intensities == 0.5).all()
+    assert np.allclose(sequence.timestamps, 1.6e9 + 0.1 * np.arange(4), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("fields", "row_padding"),
+    [
+        ([(axis, ">f4") for axis in "xyz"] + [("time", ">f8")], 0),
+        ([("timestamp", "<f8"), *((axis, "<f8") for axis in "zyx")], 0),
+        ([("X", "<f4"), ("Y", "<f4"), ("Z", "<f4"), ("", "u1"), ("offset_time", "<u4")], 13),
+    ],
+)
+def test_layouts_of_points(tmp_path, kind, fields, row_padding):
+    """Organised in 4 rows, without a return at three places."""
+    points = random_points(0).reshape(4, 50, 3)
+    points[0, 7], points[3, 2], points[2, 5, 0] = 0, np.nan, np.inf
+    rows = np.zeros((4, 50), dtype=fields)
+    for i, axis in enumerate("xyz"):
+        rows[axis if axis in rows.dtype.names else axis.upper()] = points[..., i]
+    stamped = next(name for name in rows.dtype.names if "time" in name)
+    rows[stamped] = np.arange(50)
+    write_bag(tmp_path, "street", {"/points": [rows, rows]}, kind, row_padding=row_padding)
+    scan = rosbag(tmp_path).sequence("street").scan(1)
+    kept = np.isfinite(points).all(-1) & (points != 0).any(-1)
+    assert kept.sum() == 197
+    assert np.array_equal(scan.points, points[kept])
+    assert np.allclose(scan.times, (np.broadcast_to(np.arange(50), (4, 50))[kept] - 24.5) / 49)
+    assert scan.intensities is None
+
+
+def test_every_bag_of_a_folder_is_a_sequence(tmp_path):
+    write_bag(tmp_path, "run_10", {"/points": plain(2)})
+    write_bag(tmp_path, "run_9", {"/points": plain(3)}, "mcap")
+    (tmp_path / "notes").mkdir()
+    data = rosbag(tmp_path)
+    assert data.train_sequences == data.val_sequences == data.test_sequences == ("run_9", "run_10")
+    assert [len(data.sequence(name)) for name in data.names] == [3, 2]
+    assert data.sequence("run_9") is data.sequence("run_9")  # reading through a bag takes its time
+    assert len(rosbag(tmp_path, max_frames=2).sequence("run_9")) == 2
+    assert rosbag(tmp_path, test_sequences="run_9").test_sequences == ("run_9",)
+    with pytest.raises(DataSetNotFoundError, match=r"run_9, run_10"):
+        data.sequence("run_11")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_root_may_be_one_bag(tmp_path, kind, monkeypatch):
+    path = write_bag(tmp_path, "2024.05.01", {"/points": plain(2)}, kind)
+    assert rosbag(path).names == ("2024.05.01",)
+    assert len(rosbag(path).sequence("2024.05.01")) == 2 and rosbag(path).check().usable
+    if kind != "ros1":
+        (storage,) = (file for file in path.iterdir() if file.name != "metadata.yaml")
+        assert len(rosbag(storage).sequence("2024.05.01")) == 2  # without the metadata
+        monkeypatch.chdir(path)
+        assert len(rosbag(".").sequence("2024.05.01")) == 2
+
+
+def test_a_folder_of_parts_is_one_recording(tmp_path):
+    late, early = plain(2, first=3), plain(3)
+    write_bag(tmp_path / "street", "a", {"/points": late}, start_s=1.6e9 + 0.3)
+    write_bag(tmp_path / "street", "b", {"/points": early, "/chatter": ["hello"]})
+    sequence = rosbag(tmp_path).sequence("street")
+    assert all(np.array_equal(scan.points, random_points(i)) for i, scan in enumerate(sequence)) and len(sequence) == 5
+    write_bag(tmp_path, "other", {"/points": early}, "mcap")
+    (tmp_path / "other" / "other.mcap").rename(tmp_path / "street" / "c.mcap")
+    with pytest.raises(UserError, match="several kinds"):
+        rosbag(tmp_path).sequence("street")
+
+
+def test_bags_of_one_name_are_told_apart(tmp_path):
+    write_bag(tmp_path, "run", {"/points": plain(2)})
+    write_bag(tmp_path, "run", {"/points": plain(3)}, "sqlite3")
+    assert {name: len(rosbag(tmp_path).sequence(name)) for name in find_bags(tmp_path)} == {"run": 3, "run.bag": 2}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_topics(tmp_path, kind):
+    topics = {"/front": plain(2), "/rear": plain(3), "/chatter": ["hello"], "/silent": []}
+    write_bag(tmp_path, "street", topics, kind)
+    with pytest.raises(UserError, match=r"data\.topic to one of /front \(.*, 2 messages\), /rear \(.*, 3 messages\)$"):
+        rosbag(tmp_path).sequence("street")
+    assert len(rosbag(tmp_path, topic="/rear").sequence("street")) == 3
+    for absent in ("/side", "/chatter", "/silent"):
+        with pytest.raises(UserError, match=f"no point clouds in topic {absent}\\.\n.*to one of /front"):
+            rosbag(tmp_path, topic=absent).sequence("street")
+    report = rosbag(tmp_path).check()
+    assert not report.usable and "several topics hold point clouds" in details(report, "missing")
+    assert "/chatter (std_msgs/msg/String, 1 messages)" in details(report, "found")
+    write_bag(tmp_path, "silence", {}, kind)
+    assert "no PointCloud2" in details(rosbag(tmp_path).check(), "missing")  # whatever else there is
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("topics", [{}, {"/points": []}, {"/chatter": ["hello"]}])
+def test_bags_without_clouds(tmp_path, kind, topics):
+    write_bag(tmp_path, "street", topics, kind)
+    with pytest.raises(UserError, match="no PointCloud2 messages"):
+        rosbag(tmp_path).sequence("street")
+    assert "no PointCloud2 messages" in details(rosbag(tmp_path).check(), "missing")
+
+
+def test_messages_without_points_are_passed_over(tmp_path):
+    clouds = plain(4)
+    clouds[1] = clouds[1][:0]
+    write_bag(tmp_path, "street", {"/points": clouds})
+    (tmp_path / "street.txt").write_text(kitti_rows(curve(3)))
+    sequence = rosbag(tmp_path).sequence("street")
+    assert [bool((scan.points.numpy() == random_points(i)).all()) for i, scan in zip((0, 2, 3), sequence, strict=True)]
+    assert np.allclose(sequence.T_world_lidar, curve(3))
+    write_bag(tmp_path, "nothing", {"/points": [clouds[1]]})
+    with pytest.raises(DamagedFileError, match="no message of /points has points"):
+        rosbag(tmp_path).sequence("nothing")
+
+
+@pytest.mark.parametrize(
+    ("rows", "problem"),
+    [
+        (as_rows(np.full((5, 3), np.nan), PLAIN), "scan 0 of /points: a scan without a single return"),
+        (np.zeros(5, [("range", "<f4"), ("x", "<f4")]), "no fields x, y and z, only range, x"),
+    ],
+)
+def test_clouds_that_cannot_be_used(tmp_path, rows, problem):
+    write_bag(tmp_path, "street", {"/points": [rows]})
+    with pytest.raises(DamagedFileError, match=problem):
+        rosbag(tmp_path).sequence("street").scan(0)
+    assert not rosbag(tmp_path).check().usable
+
+
+def cut_half(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def cut_end(path):
+    path.write_bytes(path.read_bytes()[:-5000])
+
+
+def overwrite_middle(path):
+    data = bytearray(path.read_bytes())
+    data[4096:-4096] = b"\xff" * (len(data) - 8192)
+    path.write_bytes(data)
+
+
+def replace_by_text(path):
+    path.write_text("this is no bag\n" * 20)
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("damage", [cut_half, cut_end, overwrite_middle, replace_by_text, empty])
+def test_damaged_bags(tmp_path, kind, damage, capsys):
+    path = write_bag(tmp_path, "street", {"/points": plain(40)}, kind)
+    (storage,) = [path] if kind == "ros1" else [p for p in path.iterdir() if p.name != "metadata.yaml"]
+    damage(storage)
+    with pytest.raises(UserError, match="cannot be read as a ROS bag"):
+        list(rosbag(tmp_path).sequence("street"))
+    with pytest.raises(SystemExit) as exited:
+        main(["check", "data=rosbag", f"data.root={tmp_path}"])
+    # the first scan may be whole
+    assert exited.value.code in (0, 1) and "street" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", ["", "rosbag2_bagfile_information: 7\n", "{", "a: b\n"])
+def test_damaged_metadata(tmp_path, content):
+    path = write_bag(tmp_path, "street", {"/points": plain()}, "sqlite3")
+    (path / "metadata.yaml").write_text(content)
+    with pytest.raises(DamagedFileError, match="cannot be read as a ROS bag"):
+        rosbag(tmp_path).sequence("street")
+    (path / "metadata.yaml").unlink()
+    assert len(rosbag(tmp_path).sequence("street")) == 3
+
+
+def test_a_bag_from_before_bags_held_definitions_of_their_messages(tmp_path):
+    path = write_bag(tmp_path, "street", {"/points": plain()}, "sqlite3")
+    (path / "metadata.yaml").unlink()
+    with closing(sqlite3.connect(path / "street.db3")) as connection:
+        connection.execute("DROP TABLE schema")
+        connection.execute("DROP TABLE message_definitions")
+        connection.execute("ALTER TABLE topics DROP COLUMN type_description_hash")
+        connection.commit()
+    assert [len(scan.points) for scan in rosbag(tmp_path).sequence("street")] == [200] * 3
+
+
+def test_missing_storage(tmp_path):
+    path = write_bag(tmp_path, "street", {"/points": plain()}, "mcap")
+    (path / "street.mcap").unlink()
+    assert "missing" in details(rosbag(tmp_path).check(), "missing")
+    with pytest.raises(DamagedFileError, match="missing"):
+        rosbag(tmp_path).sequence("street")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_tum_ground_truth_by_the_stamps_of_the_headers(tmp_path, kind):
+    write_bag(tmp_path, "street", {"/points": plain(3)}, kind, stamps=np.array([0.2, 0.5, 0.8]))
+    (tmp_path / "street.tum").write_text(tum_rows(curve(6), 0.2 * np.arange(6)))
+    sequence = rosbag(tmp_path).sequence("street")
+    two_steps = np.linalg.inv(curve(3)[1]) @ curve(5)[4]  # from 0.2 s to 0.8 s
+    assert np.allclose(sequence.T_world_lidar[2], two_steps, atol=1e-8)
+    assert np.allclose(sequence.timestamps, [0.2, 0.5, 0.8])
+    assert "street.tum with" in details(rosbag(tmp_path).check(), "found")
+
+
+def test_kitti_ground_truth_and_a_cut(tmp_path):
+    path = write_bag(tmp_path, "street", {"/points": plain(3)}, "sqlite3")
+    (path / "poses.txt").write_text(kitti_rows(curve(3)))
+    assert np.allclose(rosbag(tmp_path).sequence("street").T_world_lidar, curve(3))
+    cut = rosbag(tmp_path, max_frames=2).sequence("street")
+    assert len(cut) == len(cut.T_world_lidar) == len(cut.timestamps) == 2
+    (path / "poses.txt").write_text(kitti_rows(curve(2)))
+    with pytest.raises(DamagedFileError, match="2 poses for 3 scans"):
+        rosbag(tmp_path).sequence("street")
+
+
+@pytest.mark.parametrize("stamps", [[0, 0, 0], [2, 1, 3]])
+def test_headers_without_times_give_way_to_those_of_recording(tmp_path, stamps, caplog):
+    write_bag(tmp_path, "street", {"/points": plain(3)}, stamps=np.array(stamps))
+    timestamps = rosbag(tmp_path).sequence("street").timestamps
+    assert np.allclose(timestamps, 1.6e9 + 0.003 + 0.1 * np.arange(3), rtol=0, atol=1e-6)
+    assert "do not ascend" in caplog.text
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_messages_recorded_at_the_same_time(tmp_path, kind, monkeypatch):
+    monkeypatch.setattr("tests.data.writers.RECORDED_EVERY_NS", 0)
+    write_bag(tmp_path, "street", {"/points": plain(3)}, kind)
+    sequence = rosbag(tmp_path).sequence("street")
+    assert len({scan.points.numpy().tobytes() for scan in sequence}) == 3
+
+
+def test_deskewing_needs_point_times(tmp_path):
+    write_bag(tmp_path, "without", {"/points": plain(1)})
+    write_bag(tmp_path, "with", {"/points": [as_rows(random_points(0), OUSTER, t=TIMES_NS)]})
+    data = rosbag(tmp_path, deskew=True)
+    assert len(data.sequence("with")) == 1
+    with pytest.raises(UserError, match=r"data\.deskew=false"):
+        data.sequence("without")
+    assert "no point times" in details(data.check(), "missing")
+
+
+def test_beams_are_raised(tmp_path):
+    write_bag(tmp_path, "street", {"/points": plain(1)})
+    points, raised = (rosbag(tmp_path, beam_correction_deg=d).sequence("street").scan(0).points for d in (0.0, 1.0))
+    assert torch.allclose(points.norm(dim=1), raised.norm(dim=1)) and (raised[:, 2] > points[:, 2]).all()
+
+
+def test_fingerprint_follows_settings_and_clouds_but_not_the_place(tmp_path):
+    def fingerprint(root, clouds, **settings):
+        if not root.exists():
+            write_bag(root, "street", {"/points": clouds})
+        return rosbag(root, **settings).sequence("street").fingerprint
+
+    same = {fingerprint(tmp_path / place, plain()) for place in ("a", "b")}
+    assert len(same) == 1
+    others = {fingerprint(tmp_path / "a", [], **s) for s in ({"beam_correction_deg": 1}, {"max_frames": 2})}
+    assert len(same | others | {fingerprint(tmp_path / "c", plain(first=1))}) == 4
+
+
+def first_coordinate(sequence, index):
+    return float(sequence.scan(index).points[0, 0])
+
+
+def in_child(sequence, index, pipe):
+    pipe.send([first_coordinate(sequence, i) for i in index])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_several_processes_read_one_sequence(tmp_path, kind):
+    """A forked process inherits an open bag, and must not move its parent's place in the file."""
+    large = [as_rows(random_points(i, 30_000), OUSTER) for i in range(20)]  # a chunk of the file for each
+    write_bag(tmp_path, "street", {"/points": large}, kind)
+    sequence = rosbag(tmp_path).sequence("street")
+    expected = [first_coordinate(sequence, i) for i in range(20)]
+    context = get_context("fork")
+    here, there = context.Pipe()
+    children = [context.Process(target=in_child, args=(sequence, range(20), there)) for _ in range(2)]
+    for child in children:
+        child.start()
+    assert [first_coordinate(sequence, i) for i in range(20)] == expected
+    for child in children:
+        child.join()
+        assert child.exitcode == 0
+    assert [here.recv() for _ in children] == [expected] * 2
+    assert [first_coordinate(pickle.loads(pickle.dumps(sequence)), i) for i in range(20)] == expected
+
+
+def test_without_the_library(tmp_path, monkeypatch):
+    write_bag(tmp_path, "street", {"/points": plain(1)})
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(UserError, match=r"pip install 'lidarlearn\[rosbag\]'"):
+        rosbag(tmp_path).sequence("street")
+    assert "package rosbags" in details(rosbag(tmp_path).check(), "missing")
+
+
+def test_an_odometry_recovers_the_motion(tmp_path, monkeypatch):
+    """A street as an OS1-64 sees it from a car that turns, in the layout of its driver."""
+    frames = 6
+    path = scenes.straight_path(frames + 2, 0.9, yaw_step=0.02)
+    drive = Drive(scenes.street(), poses=path, frames=frames, sensor=os1_64(512), motion_distortion=True)
+    clouds = [as_rows(scan.points.numpy(), OUSTER, t=1e8 * (scan.times.numpy() + 0.5)) for scan in drive]
+    write_bag(tmp_path, "street", {"/os_cloud_node/points": clouds}, stamps=drive.timestamps.numpy())
+    (tmp_path / "street.tum").write_text(tum_rows(drive.T_world_lidar.numpy(), drive.timestamps.numpy()))
+    monkeypatch.setattr(evaluate, "figures", lambda *_: iter(()))  # drawing takes longer than everything else
+    settings = ["data=rosbag", f"data.root={tmp_path}", "data.deskew=true", "projection@data.projection=os1_64"]
+    monkeypatch.setattr(
+        sys, "argv", ["x", "methods=[cv+kd_f2m]", "device=cpu", f"hydra.run.dir={tmp_path}/run", *settings]
+    )
+    evaluate.main()
+    (row,) = json.loads((tmp_path / "run" / "results.json").read_text())["results"]
+    assert (row["sequence"], row["frames"]) == ("street", frames)
+    assert row["rpe_translation_m"] < 0.02 and row["rpe_rotation_deg"] < 0.2
