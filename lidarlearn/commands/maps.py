@@ -42,6 +42,7 @@ def make_maps(
     names = sorted({export.sequence for export in exports})
     data.prepare(names)
     sequences = data.sequences(names)
+    _kept(run / "maps" / "maps.json")  # a damaged file is told of before the work
     rows = []
     for export in exports:
         rows.append(_make_map(run, export, sequences[export.sequence], settings, config.data.deskew))
@@ -60,7 +61,7 @@ def _config_of(run: Path, overrides: Series[str]) -> DictConfig:
         )
     config = OmegaConf.load(path)
     assert isinstance(config, DictConfig)
-    if foreign := [override for override in overrides if not override.startswith("data.")]:
+    if foreign := [override for override in overrides if not (override.startswith("data.") and "=" in override)]:
         raise UserError(f"{' '.join(foreign)}: only settings of the data set can change\n  change: data.KEY=VALUE")
     OmegaConf.set_struct(config, True)
     config.merge_with_dotlist(list(overrides))
@@ -121,9 +122,22 @@ def _make_map(run: Path, export: Export, sequence: Sequence, settings: MapSettin
 
 def _keep(path: Path, row: dict[str, Any]) -> None:
     """Write what is known of a map beside the others that there are, in place of an earlier map of the same."""
-    earlier = json.loads(path.read_text())["maps"] if path.is_file() else []
-    others = [old for old in earlier if (old["method"], old["sequence"]) != (row["method"], row["sequence"])]
-    path.write_text(json.dumps({"maps": [*others, row]}, indent=2) + "\n")
+    others = [old for old in _kept(path) if (old["method"], old["sequence"]) != (row["method"], row["sequence"])]
+    draft = path.with_suffix(".tmp")
+    draft.write_text(json.dumps({"maps": [*others, row]}, indent=2) + "\n", encoding="utf-8")
+    draft.replace(path)
+
+
+def _kept(path: Path) -> list[dict[str, Any]]:
+    """What is known of earlier maps."""
+    if not path.is_file():
+        return []
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))["maps"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{path.absolute()}: damaged ({error})\n  change: remove it; the maps themselves stay"
+        ) from error
 
 
 def _table(rows: Series[dict[str, Any]]) -> Table:
@@ -141,7 +155,7 @@ def _table(rows: Series[dict[str, Any]]) -> Table:
     sharpest = frozenset({5} if len({row["sequence"] for row in rows}) == 1 else ())
     return Table(
         "Maps",
-        ("method", "sequence", "points", "extent [m]", "file [MB]", "MPV [cm²]"),
+        ("method", "sequence", "points", "extent [m]", "file [MB]", "MPV [cm^2]"),
         tuple(cells),
         notes=(
             "MPV: mean plane variance, how thick surfaces came out: the lower, the better the poses fit together. "

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.errors import UserError
 
 _log = logging.getLogger(__name__)
 
@@ -125,9 +126,16 @@ def sequence_names(names: Iterable[str | int] | str | int, digits: int = 0) -> t
     Args:
         names: several names, or a single one.
         digits: to which numbers are filled up.
+
+    Raises:
+        UserError: a name is a path: files of a run are called like its sequences, and shall not leave its folder.
     """
     several = [names] if isinstance(names, (str, int)) else names
-    return tuple(f"{name:0{digits}d}" if isinstance(name, int) else str(name) for name in several)
+    found = tuple(f"{name:0{digits}d}" if isinstance(name, int) else str(name) for name in several)
+    for name in found:
+        if name in ("", ".", "..") or "/" in name or "\\" in name:
+            raise UserError(f"{name!r} is no name of a sequence.\n  change: data.root to the folder that holds it")
+    return found
 
 
 def gaps(numbers: list[int]) -> list[tuple[int, int]]:

@@ -1,5 +1,6 @@
 """The map of a drive: all scans in the frame of the first, one point a voxel, and how sharp it came out."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,8 +42,8 @@ class MapSettings:
     max_range_m: float = 60.0
 
     def __post_init__(self) -> None:
-        if not self.voxel_size_m > 0:
-            raise UserError(f"voxels of {self.voxel_size_m:g} m hold no point\n  change: --voxel to more than 0")
+        if not 0 < self.voxel_size_m < math.inf:
+            raise UserError(f"voxels of {self.voxel_size_m:g} m make no map\n  change: --voxel to more than 0")
         if self.every < 1:
             raise UserError(f"every {self.every}th scan is none\n  change: --every to 1 or more")
         if not 0 <= self.min_range_m < self.max_range_m:

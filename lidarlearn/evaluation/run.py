@@ -68,7 +68,7 @@ class Export:
         """The settings with which a whole run was exported; None where there is none."""
         if not (self.summary.is_file() and self.kitti.is_file()):
             return None
-        return json.loads(self.summary.read_text()).get("settings")
+        return json.loads(self.summary.read_text(encoding="utf-8")).get("settings")
 
 
 def run_odometry(
@@ -117,7 +117,7 @@ def read_export(export: Export, sequence: Sequence) -> tuple[Float[Tensor, "n 4 
     """Poses of the LiDAR and the summary of an exported run."""
     poses = read_trajectory(export.kitti)
     frame = sequence.reference_frame
-    summary = json.loads(export.summary.read_text())
+    summary = json.loads(export.summary.read_text(encoding="utf-8"))
     return to_lidar_frame(poses, frame, frame, sequence.T_reference_lidar), summary
 
 
@@ -192,7 +192,7 @@ def _write(
     speed = len(poses) / max(seconds, 1e-9)
     summary = {"frames_per_second": speed, "health": summarize_health(records), "settings": settings or {}}
     draft = export.summary.with_suffix(".tmp")
-    draft.write_text(json.dumps(summary, indent=2) + "\n")
+    draft.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     draft.replace(export.summary)
 
 

@@ -26,7 +26,7 @@ class Frame:
     health: Health
 
 
-# On any device, of any number type; shapes are checked by `as_scan`, for these come from users.
+# Of any number type, on any device, arrays in any order of memory; `as_scan` checks them, for they come from users.
 Points = Tensor | np.ndarray
 Times = Tensor | np.ndarray
 
@@ -51,16 +51,22 @@ class ScanByScan(ABC):
 def as_scan(
     points: Points, times: Times | None, device: torch.device | None = None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"] | None]:
-    """Points and times as float32 tensors, moved to a device if one is given; see `ScanByScan.register_scan`."""
-    points = torch.as_tensor(points, dtype=torch.float32, device=device)
+    """Points and times as float32 tensors on one device, the points' if none is given; see `register_scan`."""
+    points = _as_tensor(points, device)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"register_scan: points must be (n, 3), x y z [m], but are {tuple(points.shape)}")
     if times is None:
         return points, None
-    times = torch.as_tensor(times, dtype=torch.float32, device=device)
+    times = _as_tensor(times, points.device)
     if times.shape != points.shape[:1]:
         raise ValueError(f"register_scan: times must be ({len(points)},) as the points, but are {tuple(times.shape)}")
     return points, times
+
+
+def _as_tensor(values: Tensor | np.ndarray, device: torch.device | None) -> Tensor:
+    if isinstance(values, np.ndarray):  # views that torch refuses: reversed, of another byte order, read-only
+        values = np.require(values, np.float32, ["C", "W"])
+    return torch.as_tensor(values, dtype=torch.float32, device=device)
 
 
 class InitializationAlone(ScanByScan):

@@ -257,6 +257,8 @@ def test_maps_are_made_of_what_a_run_has_left(call, no_plots, maps_of, scans, tm
         (["--method=ei"], ["ei on any sequence", "cv+kd_f2m on 0, cv+kd_f2m on 1, ni on 0, ni on 1"]),
         (["--sequence=7"], ["any method on 7", "--sequence"]),
         (["--voxel=0"], ["--voxel"]),
+        (["--voxel=inf"], ["--voxel"]),
+        (["data.root"], ["data.KEY=VALUE"]),
         (["data.roott=x"], ["roott"]),
         (["seed=1"], ["data.KEY=VALUE"]),
         ([f"data.root={tmp_path / 'gone'}"], ["gone", "data.root"]),
@@ -266,6 +268,8 @@ def test_maps_are_made_of_what_a_run_has_left(call, no_plots, maps_of, scans, tm
 
     np.save(copy / "1" / "0.npy", np.ones((50, 3), np.float32))
     assert "not the scans of the run" in maps_of(run, "--sequence=1", f"data.root={copy}")[1]
+    (run / "maps/maps.json").write_text("{")
+    assert "maps.json: damaged" in maps_of(run)[1]
 
 
 def test_an_interrupted_drive_gets_no_map(call, no_plots, maps_of, tmp_path):

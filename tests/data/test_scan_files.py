@@ -3,6 +3,7 @@ import pytest
 
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.scan_files import gaps, list_scans, natural_key, read_float32_rows, sequence_names
+from lidarlearn.errors import UserError
 from tests.data.writers import random_points, write_float32
 
 
@@ -29,6 +30,12 @@ def test_natural_key_orders_by_value_then_by_text():
 )
 def test_numbers_from_the_command_line_get_their_zeros_back(given, expected):
     assert sequence_names(given, digits=2) == expected
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../00", "a/b", "a\\b", "..", ""])
+def test_paths_are_no_names_of_sequences(name):
+    with pytest.raises(UserError, match="no name of a sequence"):
+        sequence_names(["00", name])
 
 
 def test_gaps():

@@ -3,6 +3,7 @@
 import math
 from functools import cache
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -181,8 +182,14 @@ def test_the_readmes_odometry_is_cv_kd_f2m():
 
 def test_scans_may_be_arrays_of_any_number_type():
     as_float32 = run(build("cv+kd_f2m"), scans()[:4])
-    as_arrays = run(build("cv+kd_f2m"), [points.double().numpy() for points in scans()[:4]])
-    assert torch.equal(poses(as_float32), poses(as_arrays))
+    for array in (
+        lambda points: points.double().numpy(),
+        lambda points: points.flip(0).numpy()[::-1],
+        lambda points: points.numpy().astype(">f4"),
+        lambda points: np.frombuffer(points.numpy().tobytes(), np.float32).reshape(-1, 3),  # read-only
+    ):
+        as_arrays = run(build("cv+kd_f2m"), [array(points) for points in scans()[:4]])
+        assert torch.equal(poses(as_float32), poses(as_arrays))
 
 
 @pytest.mark.gpu
