@@ -80,7 +80,7 @@ def add_settings(arguments: list[str], folder: Path) -> None:
         arguments += [f"hydra.searchpath=[file://{folder}]"]
 
 
-def require_resumable(path: Path, module: PoseNetModule, max_epochs: int | None) -> None:
+def require_resumable(path: Path, module: PoseNetModule, max_epochs: int | None, max_steps: int = -1) -> None:
     """Raise a `UserError` where a training cannot go on from a checkpoint with this configuration."""
     checkpoint = load_checkpoint(path)
     for part in _FIXED:
@@ -92,11 +92,14 @@ def require_resumable(path: Path, module: PoseNetModule, max_epochs: int | None)
                 f"ckpt={path} does not go on with another {part}: {differences}\n"
                 f"  change: leave the settings of the {part} to the checkpoint, or train anew, without ckpt"
             )
-    done = checkpoint["epoch"] + 1
-    if max_epochs is not None and 0 <= max_epochs <= done:
-        raise UserError(
-            f"ckpt={path} has already seen {done} of {max_epochs} epochs\n  change: trainer.max_epochs={2 * done}"
-        )
+    for what, done, most in (
+        ("epochs", checkpoint["epoch"] + 1, max_epochs),
+        ("steps", checkpoint["global_step"], max_steps),
+    ):
+        if most is not None and 0 <= most <= done:
+            raise UserError(
+                f"ckpt={path} has already seen {done} of {most} {what}\n  change: trainer.max_{what}={2 * done}"
+            )
 
 
 def _only(keys: tuple[str, ...], settings: dict[str, Any]) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def train(config: DictConfig, data_name: str) -> Path:
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     module = build_module(config, datamodule, data_name)
     if config.ckpt is not None:
-        require_resumable(Path(config.ckpt), module, config.trainer.max_epochs)
+        require_resumable(Path(config.ckpt), module, config.trainer.max_epochs, config.trainer.max_steps)
     trainer: Trainer = instantiate(config.trainer)
     if trainer.is_global_zero:
         write_run_description(run_folder, config)

@@ -104,7 +104,7 @@ def test_what_cannot_change_says_so(checkpoint, tmp_path, override, words):
     config = composed(tmp_path / "o", checkpoint, override)
     module = train.build_module(config, instantiate(config.datamodule), "folder")
     with pytest.raises(UserError, match=words):
-        require_resumable(checkpoint, module, config.trainer.max_epochs)
+        require_resumable(checkpoint, module, config.trainer.max_epochs, config.trainer.max_steps)
 
 
 def test_a_finished_training_is_prolonged_by_nothing_but_more_epochs(checkpoint, scans, tmp_path):
