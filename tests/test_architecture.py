@@ -101,6 +101,27 @@ def test_imports_stay_light():
         assert not unwanted & set(loaded.split()), module
 
 
+def leaves_encoding_to_the_machine(node: ast.AST) -> bool:
+    """Whether a call reads or writes text in whatever encoding the locale has."""
+    if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+        return False
+    binary = any(isinstance(a, ast.Constant) and a.value in ("rb", "wb", "ab") for a in node.args)
+    is_text = node.func.attr in ("read_text", "write_text") or (node.func.attr == "open" and not binary)
+    return is_text and not any(keyword.arg == "encoding" for keyword in node.keywords)
+
+
+def test_text_is_utf_8_on_every_machine():
+    """Names of sequences are anything, and Hydra reads UTF-8."""
+    lines = {
+        f"{path.relative_to(PACKAGE)}:{node.lineno}"
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if leaves_encoding_to_the_machine(node)
+    }
+    owing = ("data/", "evaluation/run.py", "evaluation/maps.py", "commands/maps.py")
+    assert not {line for line in lines if not line.startswith(owing)}
+
+
 def test_files_stay_short():
     lengths = {str(path.relative_to(PACKAGE)): len(path.read_text().splitlines()) for path in MODULES}
     assert {name: count for name, count in lengths.items() if count > 280} == {}

@@ -11,6 +11,7 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
@@ -20,10 +21,16 @@ from lidarlearn.training.checkpoints import CheckpointError, load_checkpoint
 from lidarlearn.training.parts import require_trusted
 
 OPTION = "checkpoint"
+_SEARCH_PATH = "hydra.searchpath"
+_CLUSTER = "hydra/launcher=submitit_slurm"
 
 
-def given_checkpoint(arguments: Sequence[str]) -> Path | None:
+def given_checkpoint(arguments: Sequence[str], instead_of_several: str) -> Path | None:
     """The checkpoint on a command line, None where there is none, or `null`.
+
+    Args:
+        arguments: the command line.
+        instead_of_several: what to do rather than to give several checkpoints.
 
     Raises:
         UserError: there are several, for the jobs of a multirun.
@@ -34,10 +41,7 @@ def given_checkpoint(arguments: Sequence[str]) -> Path | None:
     except OverrideParseException:
         return None  # composing the configuration will say what is wrong
     if path is not None and not isinstance(path, str):
-        raise UserError(
-            f"{given}: each checkpoint may come with data of its own\n"
-            "  change: one at a time; to evaluate several, add data=..."
-        )
+        raise UserError(f"{given}: each checkpoint comes with settings of its own\n  change: {instead_of_several}")
     return None if path is None else Path(path)
 
 
@@ -52,7 +56,7 @@ def add_data(arguments: list[str], folder: Path) -> None:
     """
     if any(argument.startswith(("data=", "experiment=")) for argument in arguments):
         return
-    path = given_checkpoint(arguments)
+    path = given_checkpoint(arguments, "one at a time; to evaluate several, add data=...")
     if path is None:
         return
     trained_on = load_checkpoint(path)["hyper_parameters"]["trained_on"]
@@ -62,14 +66,47 @@ def add_data(arguments: list[str], folder: Path) -> None:
         raise CheckpointError(path, f"was trained on data={name}, which is no name of a data set.")
     settings = {key: value for key, value in data.items() if key != "root"}
     write_option(folder, "data", {"defaults": [f"{name}@_here_", "_self_"], **settings})
-    arguments += [f"data={OPTION}", f"hydra.searchpath=[file://{folder}]"]
+    arguments += [f"data={OPTION}"]
+    add_to_search_path(arguments, folder)
+
+
+def add_to_search_path(arguments: list[str], folder: Path) -> None:
+    """Let Hydra find the options in a folder, beside those where the command line has it search already.
+
+    Args:
+        arguments: the command line; it is completed.
+        folder: of this machine alone.
+
+    Raises:
+        UserError: the jobs run on machines that do not see the folder.
+    """
+    if _CLUSTER in arguments:
+        raise UserError(
+            f"{_CLUSTER}: its nodes do not see the settings of the checkpoint, which lie in {folder}\n"
+            "  change: submit a job of your own that runs this command without the launcher, "
+            "or, for an evaluation, add data=... and its settings"
+        )
+    given = [argument for argument in arguments if argument.startswith(f"{_SEARCH_PATH}=")]
+    places = [f"file://{folder.as_posix()}"]
+    if given:
+        places_given = OverridesParser.create().parse_override(given[0]).value()  # Hydra takes the first one
+        if not isinstance(places_given, list):
+            return  # composing the configuration will say what is wrong
+        places += places_given
+    arguments[:] = [argument for argument in arguments if argument not in given]
+    arguments += [f"{_SEARCH_PATH}=[{','.join(quoted(str(place)) for place in dict.fromkeys(places))}]"]
+
+
+def quoted(text: str) -> str:
+    """A text in Hydra's grammar, in which spaces, commas and the like have meanings of their own."""
+    return QuotedString(text, Quote.double).with_quotes()
 
 
 def write_option(folder: Path, group: str, content: Mapping[str, Any], header: str = "") -> None:
     """Make `checkpoint` an option of a group."""
     path = folder / group / f"{OPTION}.yaml"
     path.parent.mkdir(parents=True)
-    path.write_text(header + OmegaConf.to_yaml(OmegaConf.create(dict(content))))
+    path.write_text(header + OmegaConf.to_yaml(OmegaConf.create(dict(content))), encoding="utf-8")
 
 
 def chosen_data(config: DictConfig) -> str:

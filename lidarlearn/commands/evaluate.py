@@ -213,6 +213,6 @@ def _report(run_folder: Path, protocol: dict[str, Any], evaluation: Evaluation, 
         for name, figure in figures(evaluation.sequences, poses, scores, groups):
             write_plots(run_folder / "plots", [(name, figure)])
             writer.add_figure(name, figure)
-        writer.add_text("results", (run_folder / "results.md").read_text())
+        writer.add_text("results", (run_folder / "results.md").read_text(encoding="utf-8"))
     print_tables(report_tables(protocol["data"], scores, trained_on, layout))
     print(f"results: {run_folder / 'results.md'}  plots: {run_folder / 'plots'}")

@@ -8,7 +8,13 @@ from torch import nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from lidarlearn.commands.checkpoint_options import OPTION, add_data, given_checkpoint, write_option
+from lidarlearn.commands.checkpoint_options import (
+    OPTION,
+    add_data,
+    add_to_search_path,
+    given_checkpoint,
+    write_option,
+)
 from lidarlearn.errors import UserError
 from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.module import PoseNetModule
@@ -47,7 +53,7 @@ def add_settings(arguments: list[str], folder: Path) -> None:
         arguments: the command line; it is completed.
         folder: an empty one for the options.
     """
-    path = given_checkpoint(arguments)
+    path = given_checkpoint(arguments, "one at a time")
     if path is None or _RECIPE in arguments:  # the further processes of a training inherit all
         return
     add_data(arguments, folder)
@@ -76,11 +82,10 @@ def add_settings(arguments: list[str], folder: Path) -> None:
         write_option(folder, part, parts[part])
     write_option(folder, "recipe", recipe, header="# @package _global_\n")
     arguments += [_RECIPE, "~recipe/for_data"]
-    if not any(argument.startswith("hydra.searchpath=") for argument in arguments):
-        arguments += [f"hydra.searchpath=[file://{folder}]"]
+    add_to_search_path(arguments, folder)
 
 
-def require_resumable(path: Path, module: PoseNetModule, max_epochs: int | None) -> None:
+def require_resumable(path: Path, module: PoseNetModule, max_epochs: int | None, max_steps: int = -1) -> None:
     """Raise a `UserError` where a training cannot go on from a checkpoint with this configuration."""
     checkpoint = load_checkpoint(path)
     for part in _FIXED:
@@ -92,11 +97,14 @@ def require_resumable(path: Path, module: PoseNetModule, max_epochs: int | None)
                 f"ckpt={path} does not go on with another {part}: {differences}\n"
                 f"  change: leave the settings of the {part} to the checkpoint, or train anew, without ckpt"
             )
-    done = checkpoint["epoch"] + 1
-    if max_epochs is not None and 0 <= max_epochs <= done:
-        raise UserError(
-            f"ckpt={path} has already seen {done} of {max_epochs} epochs\n  change: trainer.max_epochs={2 * done}"
-        )
+    for what, done, most in (
+        ("epochs", checkpoint["epoch"] + 1, max_epochs),
+        ("steps", checkpoint["global_step"], max_steps),
+    ):
+        if most is not None and 0 <= most <= done:
+            raise UserError(
+                f"ckpt={path} has already seen {done} of {most} {what}\n  change: trainer.max_{what}={2 * done}"
+            )
 
 
 def _only(keys: tuple[str, ...], settings: dict[str, Any]) -> dict[str, Any]:

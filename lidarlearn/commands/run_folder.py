@@ -29,7 +29,7 @@ def write_run_description(folder: Path, config: DictConfig) -> None:
     """Write `config.yaml`, every setting of the run with its value, and `git_revision.txt`."""
     folder.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
-    (folder / "git_revision.txt").write_text(git_revision() + "\n")
+    (folder / "git_revision.txt").write_text(git_revision() + "\n", encoding="utf-8")
 
 
 def _git(*arguments: str) -> str:

@@ -1,6 +1,5 @@
 """`python train.py`: train PoseNet on a data set, with or without ground truth."""
 
-import os
 import shlex
 import string
 import sys
@@ -12,11 +11,12 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 import lidarlearn
 from lidarlearn.commands import entry_point
-from lidarlearn.commands.checkpoint_options import chosen_data
+from lidarlearn.commands.checkpoint_options import chosen_data, quoted
 from lidarlearn.commands.device import resolve_device
 from lidarlearn.commands.resume import add_settings, require_resumable, settings_to_keep
 from lidarlearn.commands.run_folder import git_revision, write_run_description
@@ -54,13 +54,13 @@ def train(config: DictConfig, data_name: str) -> Path:
     resolve_device(config)
     _require_workable(config)
     run_folder = Path(config.run_dir)
-    if os.environ.get("LOCAL_RANK", "0") == "0":  # the other processes come when the first has begun
+    trainer: Trainer = instantiate(config.trainer)
+    if trainer.is_global_zero:  # the other processes may come when the first has begun
         _require_free(run_folder, config.ckpt)
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     module = build_module(config, datamodule, data_name)
     if config.ckpt is not None:
-        require_resumable(Path(config.ckpt), module, config.trainer.max_epochs)
-    trainer: Trainer = instantiate(config.trainer)
+        require_resumable(Path(config.ckpt), module, config.trainer.max_epochs, config.trainer.max_steps)
     if trainer.is_global_zero:
         write_run_description(run_folder, config)
     trainer.fit(module, datamodule=datamodule, ckpt_path=config.ckpt)
@@ -77,16 +77,19 @@ def evaluate_command(checkpoint: Path, overrides: Sequence[str] = ()) -> str:
     """
     path = str(checkpoint.relative_to(Path.cwd()) if checkpoint.is_relative_to(Path.cwd()) else checkpoint)
     if not _PLAIN_CHARACTERS.issuperset(path):
-        path = '"' + path.replace('"', r"\"") + '"'  # for Hydra's grammar; the shell's quotes come around it
+        path = quoted(path)  # for Hydra; the shell's quotes come around it
     program = "python evaluate.py" if Path("evaluate.py").is_file() else "lidarlearn-evaluate"
     arguments = [f"ckpt={path}", *(override for override in overrides if override.startswith("data.root="))]
     return f"{program} {shlex.join(arguments)}"
 
 
 def _train_and_say_what_next(config: DictConfig) -> None:
-    checkpoint = train(config, chosen_data(config)).resolve()
-    first_process = os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
-    if first_process and checkpoint.exists():
+    _say_what_next(train(config, chosen_data(config)).resolve(), config)
+
+
+@rank_zero_only
+def _say_what_next(checkpoint: Path, config: DictConfig) -> None:
+    if checkpoint.exists():
         print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
         print(f"next:       {evaluate_command(checkpoint, HydraConfig.get().overrides.task)}")
 

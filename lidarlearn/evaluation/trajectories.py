@@ -41,7 +41,7 @@ def write_tum(path: Path, T_world: Float[Tensor, "n 4 4"], timestamps: Float[Ten
     """
     times = torch.arange(len(T_world), dtype=torch.float64) if timestamps is None else timestamps
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w") as file:
+    with path.open("w", encoding="utf-8") as file:
         file.write("# time [s] tx ty tz [m] qx qy qz qw\n")
         if not len(T_world):
             return
@@ -211,7 +211,7 @@ def _columns(path: Path) -> int:
     """Numbers in the first row of a trajectory file, which tell the format."""
     if not path.is_file():
         raise TrajectoryError(f"{path.absolute()}: no such trajectory.\n  change: trajectories=PATH")
-    with path.open(errors="replace") as file:
+    with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:
             words = line.split("#")[0].split()
             if words:

@@ -60,7 +60,7 @@ _AXES = ("x", "y", "z")
 def write_health(path: Path, records: Iterable[Health]) -> None:
     """Write one row per frame as CSV, cells empty where nothing is known; the weakest direction takes three columns."""
     names = [f.name for f in fields(Health) if f.name != "weakest_direction"]
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow([*names, "flagged", *(f"weakest_{axis}" for axis in _AXES)])
         for record in records:

@@ -87,6 +87,36 @@ def test_the_command_line_and_experiments_come_after_the_checkpoint(checkpoint, 
     assert config.loss["_target_"].endswith("WeightedIcpLoss")
 
 
+@pytest.mark.parametrize("program", ["train", "evaluate"])
+@pytest.mark.parametrize("folder", ["t m,p", "t=(1)", "John Doe's", 'a"b', "a\\b\\", "[x]{y: z}", "é"])
+def test_options_are_found_wherever_temporary_files_lie(checkpoint, tmp_path, folder, program):
+    assert composed(tmp_path / folder, checkpoint, program=program).data.max_frames == FRAMES
+
+
+@pytest.mark.parametrize("program", ["train", "evaluate"])
+def test_options_of_the_user_are_found_too(checkpoint, tmp_path, program):
+    place = tmp_path / "my, options" / "projection" / "mine.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text("defaults: [hdl64@_here_, _self_]\nheight: 17\n")
+    overrides = [f"hydra.searchpath=['file://{tmp_path}/my, options']", "projection@data.projection=mine"]
+    config = composed(tmp_path / "o", checkpoint, *overrides, "data=folder", program=program)
+    assert config.data.projection.height == 17
+    config = composed(tmp_path / "o", checkpoint, overrides[0], program=program)
+    assert config.data.max_frames == FRAMES
+
+
+@pytest.mark.parametrize(("program", "remedy"), [("train", "one at a time$"), ("evaluate", r"add data=\.\.\.$")])
+def test_several_checkpoints_at_once_are_refused(tmp_path, program, remedy):
+    with pytest.raises(UserError, match=remedy):
+        composed(tmp_path / "o", Path("a.ckpt,b.ckpt"), program=program)
+
+
+@pytest.mark.parametrize("program", ["train", "evaluate"])
+def test_nodes_that_do_not_see_the_settings_are_not_sent_for_them(checkpoint, tmp_path, program):
+    with pytest.raises(UserError, match=r"submitit_slurm: its nodes do not see(.|\n)*change: submit a job"):
+        composed(tmp_path / "o", checkpoint, "hydra/launcher=submitit_slurm", program=program)
+
+
 @pytest.mark.parametrize(
     ("override", "words"),
     [
@@ -104,7 +134,7 @@ def test_what_cannot_change_says_so(checkpoint, tmp_path, override, words):
     config = composed(tmp_path / "o", checkpoint, override)
     module = train.build_module(config, instantiate(config.datamodule), "folder")
     with pytest.raises(UserError, match=words):
-        require_resumable(checkpoint, module, config.trainer.max_epochs)
+        require_resumable(checkpoint, module, config.trainer.max_epochs, config.trainer.max_steps)
 
 
 def test_a_finished_training_is_prolonged_by_nothing_but_more_epochs(checkpoint, scans, tmp_path):

@@ -10,13 +10,14 @@ import time
 from pathlib import Path
 
 import pytest
+from lightning.pytorch.utilities import rank_zero_only
 
-from lidarlearn.commands import run_folder
+from lidarlearn.commands import run_folder, train
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.run_folder import git_revision
 from lidarlearn.commands.train import evaluate_command
 from lidarlearn.training.checkpoints import load_checkpoint
-from tests.training.runs import curves
+from tests.training.runs import configured, curves
 
 TRAIN = Path(__file__).parents[2] / "train.py"
 SMALL = (
@@ -82,6 +83,29 @@ def test_the_command_that_is_printed_survives_shell_and_hydra(path, printed, tmp
     assert evaluate_command(tmp_path / path) == f"lidarlearn-evaluate {printed}"
     (tmp_path / "evaluate.py").touch()
     assert evaluate_command(tmp_path / path) == f"python evaluate.py {printed}"
+
+
+def test_a_later_process_takes_the_checkpoints_of_the_first_for_its_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(rank_zero_only, "rank", 0)  # set by the trainer, and to be forgotten
+    srun = {"NTASKS": 2, "NTASKS_PER_NODE": 2, "JOB_NAME": "a", "PROCID": 1, "LOCALID": 1, "NODEID": 0}
+    for name, value in srun.items():
+        monkeypatch.setenv(f"SLURM_{name}", str(value))
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "run" / "checkpoints" / "last.ckpt").touch()
+    monkeypatch.setattr(train, "build_module", lambda *_: pytest.exit("came this far"))
+    config = configured(tmp_path / "run", "trainer.devices=2", "trainer.strategy=ddp")
+    with pytest.raises(pytest.exit.Exception, match="came this far"):
+        train.train(config, "boxes")
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_the_first_process_alone_says_what_is_next(tmp_path, monkeypatch, capsys, rank):
+    (tmp_path / "best.ckpt").touch()
+    monkeypatch.setattr(rank_zero_only, "rank", rank)
+    monkeypatch.setattr(train, "train", lambda *_: tmp_path / "best.ckpt")
+    monkeypatch.setattr(sys, "argv", ["train.py", f"hydra.run.dir={tmp_path}/run"])
+    train.main()
+    assert capsys.readouterr().out.count("next:") == (rank == 0)
 
 
 @pytest.mark.slow

@@ -117,11 +117,18 @@ def test_a_folder_that_holds_another_training_is_refused(run, tmp_path):
         train(configured(folder, f"loss={loss}", f"ckpt={best}", "trainer.max_epochs=1", frames=5), data_name="boxes")
 
 
-def test_resuming_where_nothing_is_left_says_so(run, tmp_path):
+@pytest.mark.parametrize(
+    ("most", "words"),
+    [
+        (f"trainer.max_epochs={EPOCHS}", r"already seen 3 of 3 epochs\n  change: trainer\.max_epochs=6"),
+        ("trainer.max_steps=20", r"already seen 24 of 20 steps\n  change: trainer\.max_steps=48"),
+    ],
+)
+def test_resuming_where_nothing_is_left_says_so(run, tmp_path, most, words):
     folder, _, loss = run
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    config = configured(tmp_path / "r", f"loss={loss}", f"trainer.max_epochs={EPOCHS}", f"ckpt={checkpoint}", frames=5)
-    with pytest.raises(UserError, match=r"already seen 3 of 3 epochs(.|\n)*trainer\.max_epochs=6"):
+    config = configured(tmp_path / "r", f"loss={loss}", most, f"ckpt={checkpoint}", frames=5)
+    with pytest.raises(UserError, match=words):
         train(config, data_name="boxes")
 
 
@@ -132,13 +139,13 @@ def test_resuming_with_another_model_says_so(run, tmp_path):
         train(config, data_name="boxes")
 
 
-def resumed(folder, run_dir, loss, **drives):
-    """Go on for an epoch from a folder's last checkpoint, at a rate that spoils the network; the best one then."""
+def resumed(folder, ended, run_dir, loss, **drives):
+    """Go on for an epoch from a copy of a folder, at a rate that spoils the network; the best checkpoint then."""
     last = folder / "checkpoints" / "last.ckpt"
     content = torch.load(last, weights_only=True)
     for group in content["optimizer_states"][0]["param_groups"]:
         group["lr"] = group["initial_lr"] = 1.0
-    spoilt = run_dir.parent / "checkpoints"
+    spoilt = ended / "checkpoints"
     spoilt.mkdir()
     torch.save(content, spoilt / "last.ckpt")
     (spoilt / "best.ckpt").write_bytes((folder / "checkpoints" / "best.ckpt").read_bytes())
@@ -148,7 +155,7 @@ def resumed(folder, run_dir, loss, **drives):
 
 def test_best_of_a_resumed_training_is_the_best_of_all(run, tmp_path):
     folder, best, loss = run
-    after = resumed(folder, tmp_path / "resumed", loss)
+    after = resumed(folder, tmp_path, tmp_path / "resumed", loss)
     worse = curves(tmp_path / "resumed")["val/error"][0][1]
     assert worse > min(value for _, value in curves(folder)["val/error"])
     assert after["epoch"] == load_checkpoint(best)["epoch"]
@@ -156,7 +163,21 @@ def test_best_of_a_resumed_training_is_the_best_of_all(run, tmp_path):
 
 def test_best_is_chosen_anew_where_other_drives_are_held_out(run, tmp_path):
     folder, _, loss = run
-    assert resumed(folder, tmp_path / "resumed", loss, val_sequences=["1"])["epoch"] == EPOCHS
+    assert resumed(folder, tmp_path, tmp_path / "resumed", loss, val_sequences=["1"])["epoch"] == EPOCHS
+
+
+def test_what_validation_does_not_see_leaves_the_best_as_it_is(run, tmp_path):
+    folder, best, loss = run
+    after = resumed(folder, tmp_path, tmp_path, loss, train_sequences=["1"])  # in the same folder
+    assert after["epoch"] == load_checkpoint(best)["epoch"]
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
+
+
+def test_a_best_checkpoint_that_does_not_compare_is_kept(run, tmp_path):
+    folder, best, loss = run
+    with pytest.warns(UserWarning, match=r"another way \(data\.val_sequences\)(.|\n)*best_before_epoch_004\.ckpt"):
+        assert resumed(folder, tmp_path, tmp_path, loss, val_sequences=["1"])["epoch"] == EPOCHS
+    assert (tmp_path / "checkpoints" / "best_before_epoch_004.ckpt").read_bytes() == best.read_bytes()
 
 
 @pytest.mark.slow
