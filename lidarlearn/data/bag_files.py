@@ -5,7 +5,7 @@ such files: the parts into which a recorder has split one recording.
 """
 
 import os
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -142,11 +142,23 @@ class Bag:
         """All PointCloud2 messages of a topic in the order of recording, each with its place."""
         for part, reader in enumerate(self._opened()):
             before, rank = None, 0
+            connections = _connections(reader, topic)
             with _readable(self.path):
-                for _, time_ns, raw in reader.messages(_connections(reader, topic)) if reader.message_count else ():
+                for _, time_ns, raw in reader.messages(connections) if connections else ():  # for none it gives all
                     rank = rank + 1 if time_ns == before else 0
                     before = time_ns
                     yield Place(part, time_ns, rank), _decode(reader, raw)
+
+    def ends(self, topic: str) -> tuple[tuple[int, Any], tuple[int, Any]]:
+        """The first and the last PointCloud2 message of a topic that has some, and when each was recorded [ns]."""
+        place, first = next(self.messages(topic))
+        reader = next(r for r in reversed(self._opened()) if _connections(r, topic))
+        with _readable(self.path):
+            # from the end: reading through a bag takes minutes
+            starts = (*(reader.end_time - seconds * 10**9 for seconds in (1, 10, 100)), None)
+            found = (deque(reader.messages(_connections(reader, topic), start=start), maxlen=1) for start in starts)
+            _, last_ns, raw = next(filter(None, found))[0]
+            return (place.time_ns, first), (last_ns, _decode(reader, raw))
 
     def message(self, topic: str, place: Place) -> Any:
         """One PointCloud2 message."""
@@ -193,7 +205,7 @@ def _reader(part: Path) -> Any:
 
 
 def _connections(reader: Any, topic: str) -> list[Any]:
-    return [c for c in reader.connections if (c.topic, c.msgtype) == (topic, POINT_CLOUD)]
+    return [c for c in reader.connections if (c.topic, c.msgtype) == (topic, POINT_CLOUD) and c.msgcount]
 
 
 def _decode(reader: Any, raw: bytes) -> Any:

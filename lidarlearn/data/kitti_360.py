@@ -114,7 +114,8 @@ class Kitti360(DataSetOnDisk):
             raise self.not_found(name, str(stamps.relative_to(self.root)))
         truth = self._poses(name, stamps)
         if truth is not None:
-            scans = covered(name, scans, read_timestamps(stamps, scans.numbers), truth.timestamps)
+            times = read_timestamps(stamps, scans.numbers)
+            scans = scans.select(covered(name, times, truth.timestamps))
         scans = scans.first(self.max_frames)
         if not len(scans):
             raise DamagedFileError(self._poses_file(name), f"its poses belong to none of the scans of {name}")

@@ -120,7 +120,7 @@ class Nclt(DataSetOnDisk):
         ground_truth = self._ground_truth_file(name)
         truth = None if ground_truth is None else read_ground_truth(ground_truth)
         if truth is not None:
-            scans = covered(name, scans, _timestamps(scans), truth.timestamps)
+            scans = scans.select(covered(name, _timestamps(scans), truth.timestamps))
         scans = scans.first(self.max_frames)
         if ground_truth is not None and not len(scans):
             raise DamagedFileError(ground_truth, f"its times do not overlap with those of the scans of {name}")

@@ -114,7 +114,7 @@ class NewerCollege(DataSetOnDisk):
         truth_file = self._truth_file(name)
         truth = read_registered_poses(truth_file) if truth_file.is_file() else None
         if truth is not None:
-            scans = covered(name, scans, _middles(scans), truth.timestamps)
+            scans = scans.select(covered(name, _middles(scans), truth.timestamps))
         scans = scans.first(self.max_frames)
         if not len(scans):
             raise DamagedFileError(truth_file, f"its times do not overlap with those of the scans of {name}")
