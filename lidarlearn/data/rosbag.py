@@ -154,6 +154,8 @@ class Rosbag(DataSetOnDisk):
         """Open a bag and read through its clouds for their times, the first time that it is asked for."""
         if name not in self._sequences:
             bag = self._bag(name)
+            if doubt := bag.doubt():
+                _log.warning("%s: %s", name, doubt)
             path = find_ground_truth(bag.path, name)
             truth = None if path is None else read_ground_truth(path)
             self._sequences[name] = self._open(name, bag, self.max_frames, truth)
@@ -199,6 +201,8 @@ class Rosbag(DataSetOnDisk):
             report.found(name, f"{bag.path}: {size / 1e6:,.1f} MB, {bag.duration_s():.1f} s")
             for topic in bag.topics():
                 report.found(name, f"topic {topic}")
+            if doubt := bag.doubt():
+                report.odd(name, doubt)
             clouds = bag.cloud_topic(self.topic)
             path = find_ground_truth(bag.path, name)
             describe_ground_truth(report, name, path)

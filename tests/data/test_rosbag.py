@@ -3,6 +3,7 @@
 import json
 import pickle
 import sqlite3
+import subprocess
 import sys
 from contextlib import closing
 from multiprocessing import get_context
@@ -53,8 +54,7 @@ def details(report, level):
 
 @pytest.mark.parametrize(
     ("kind", "compression"),
-    [(kind, None) for kind in KINDS]
-    + [("ros1", "bz2"), ("ros1", "lz4"), ("sqlite3", "MESSAGE"), ("sqlite3", "FILE"), ("mcap", "STORAGE")],
+    [(kind, None) for kind in KINDS] + [("ros1", "bz2"), ("ros1", "lz4"), ("sqlite3", "MESSAGE"), ("mcap", "STORAGE")],
 )
 def test_round_trip(tmp_path, kind, compression):
     clouds = [as_rows(random_points(i), OUSTER, intensity=100, t=TIMES_NS) for i in range(4)]
@@ -134,10 +134,36 @@ def test_a_folder_of_parts_is_one_recording(tmp_path):
         rosbag(tmp_path).sequence("street")
 
 
+@pytest.mark.parametrize(("later_s", "said"), [(13, "are 10 s apart"), (1.5, "overlap by 1 s"), (3, None), (2.5, None)])
+def test_recordings_that_are_no_parts_of_one(tmp_path, later_s, said, caplog):
+    for name, start_s in (("run1", 1.6e9), ("run2", 1.6e9 + later_s)):
+        write_bag(tmp_path / "day", name, {"/points": plain(30)}, start_s=start_s)
+    report = rosbag(tmp_path).check()
+    assert report.usable and len(rosbag(tmp_path).sequence("day")) <= 60
+    for text in (details(report, "odd"), caplog.text):
+        assert (f"data.root={tmp_path / 'day'}" in text) == (said is not None)
+        assert said is None or f"two of them {said}" in text
+    assert rosbag(tmp_path / "day").names == ("run1", "run2")
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_files_compressed_as_a_whole_are_to_be_unpacked_once(tmp_path, kind):
+    path = write_bag(tmp_path, "street", {"/points": plain(3)}, kind, compression="FILE")
+    with pytest.raises(UserError, match=f"rosbags-convert --src {path} "):
+        rosbag(tmp_path).sequence("street")
+    assert "compressed as a whole" in details(rosbag(tmp_path).check(), "missing")
+    convert = [sys.executable, "-m", "rosbags.convert", "--src", path, "--dst", tmp_path / "unpacked"]
+    subprocess.run(convert, check=True)
+    assert len(rosbag(tmp_path).sequence("unpacked")) == 3
+
+
 def test_bags_of_one_name_are_told_apart(tmp_path):
     write_bag(tmp_path, "run", {"/points": plain(2)})
     write_bag(tmp_path, "run", {"/points": plain(3)}, "sqlite3")
     assert {name: len(rosbag(tmp_path).sequence(name)) for name in find_bags(tmp_path)} == {"run": 3, "run.bag": 2}
+    (tmp_path / "run.txt").write_text(kitti_rows(curve(3)))
+    assert rosbag(tmp_path).sequence("run").T_world_lidar is not None
+    assert rosbag(tmp_path).sequence("run.bag").T_world_lidar is None
 
 
 @pytest.mark.parametrize("kind", KINDS)
