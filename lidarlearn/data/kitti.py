@@ -105,7 +105,7 @@ class KittiOdometry(DataSetOnDisk):
         folder = self.root / "sequences" / name
         scans = self._scans(name).first(self.max_frames)
         if not len(scans):
-            raise self.not_found(name, f"sequences/{name}/velodyne/*.bin")
+            raise self.not_found(name, f"sequences/{name}/velodyne/*.bin{scans.misnamed}")
         if not (folder / "calib.txt").is_file():
             raise self.not_found(name, f"sequences/{name}/calib.txt")
         warn_of_gaps(name, scans)
@@ -145,7 +145,7 @@ class KittiOdometry(DataSetOnDisk):
             layout.describe_rows(report, name, poses, "poses", rows_needed, needed=name in self.test_sequences)
 
     def _scans(self, name: str) -> ScanFiles:
-        return list_scans(self.root / "sequences" / name / "velodyne", (".bin",), r"\d{6}")
+        return list_scans(self.root / "sequences" / name / "velodyne", (".bin",), r"\d{6}", "000000.bin")
 
     def _ground_truth(
         self, name: str, scans: ScanFiles, T_camera_lidar: Float[Tensor, "4 4"]

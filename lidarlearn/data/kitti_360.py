@@ -108,7 +108,7 @@ class Kitti360(DataSetOnDisk):
         """Open a drive; scans before its first and after its last pose are left out."""
         scans = self._scans(name)
         if not len(scans):
-            raise self.not_found(name, f"data_3d_raw/{drive_folder(name)}/velodyne_points/data/*.bin")
+            raise self.not_found(name, f"data_3d_raw/{drive_folder(name)}/velodyne_points/data/*.bin{scans.misnamed}")
         stamps = self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "timestamps.txt"
         if not stamps.is_file():
             raise self.not_found(name, str(stamps.relative_to(self.root)))
@@ -163,9 +163,8 @@ class Kitti360(DataSetOnDisk):
             note(name, f"no ground truth: no {poses.relative_to(self.root)}")
 
     def _scans(self, name: str) -> ScanFiles:
-        return list_scans(
-            self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "data", (".bin",), r"\d{10}"
-        )
+        folder = self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "data"
+        return list_scans(folder, (".bin",), r"\d{10}", "0000000000.bin")
 
     def _poses_file(self, name: str) -> Path:
         return self.root / "data_poses" / drive_folder(name) / "poses.txt"

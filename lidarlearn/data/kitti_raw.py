@@ -139,7 +139,7 @@ class KittiRaw(DataSetOnDisk):
         folder = self._folder(name)
         scans = self._scans(name).first(self.max_frames)
         if not len(scans):
-            raise self._lacking(name, folder / "velodyne_points" / "data" / "*.bin")
+            raise self._lacking(name, folder / "velodyne_points" / "data" / f"*.bin{scans.misnamed}")
         warn_of_gaps(name, scans)
         timestamps = self._timestamps(name, scans)
         return KittiRawSequence(
@@ -190,7 +190,7 @@ class KittiRaw(DataSetOnDisk):
 
     def _scans(self, name: str) -> ScanFiles:
         drive = _drive(name)
-        scans = list_scans(self._folder(name) / "velodyne_points" / "data", (".bin",), r"\d{10}")
+        scans = list_scans(self._folder(name) / "velodyne_points" / "data", (".bin",), r"\d{10}", "0000000000.bin")
         last = math.inf if drive.last is None else drive.last
         return scans.select(i for i, number in enumerate(scans.numbers) if drive.first <= number <= last)
 

@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from lidarlearn.data.errors import ROOT_REMEDY
-from lidarlearn.data.scan_files import ScanFiles, gaps, subfolders
+from lidarlearn.data.scan_files import ScanFiles, examples, gaps, subfolders
 from lidarlearn.data.sequence import LayoutReport
 from lidarlearn.errors import UserError
-
-_SHOWN = 5  # so many examples are listed before "..."
 
 
 def find_root(root: Path, is_root: Callable[[Path], bool]) -> Path | None:
@@ -72,11 +70,11 @@ def describe_scans(
         smallest_bytes: below which a file cannot hold a scan.
     """
     if not len(scans):
-        report.missing(name, f"no scans in {scans.folder}")
+        report.missing(name, f"no scans in {scans.folder}{scans.misnamed}")
         return
     report.found(name, f"{len(scans)} scans, {scans.names[0]} to {scans.names[-1]}")
     if scans.others:
-        shown = ", ".join(map(repr, scans.others[:_SHOWN])) + (", ..." if len(scans.others) > _SHOWN else "")
+        shown = examples(map(repr, scans.others))
         report.odd(name, f"{len(scans.others)} files that are not named like scans are left out: {shown}")
     sizes = np.array(scans.sizes)
     broken = (sizes < smallest_bytes) | (sizes % (bytes_per_point or 1) != 0)
@@ -86,8 +84,8 @@ def describe_scans(
     if small.any():
         report.odd(name, f"{small.sum()} files less than a quarter of the usual size: {_files(scans, small)}")
     if numbered and (holes := gaps(scans.numbers)):
-        shown = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in holes[:_SHOWN])
-        report.odd(name, f"{len(holes)} gaps in the numbering: {shown}{', ...' if len(holes) > _SHOWN else ''}")
+        shown = examples(str(a) if a == b else f"{a}-{b}" for a, b in holes)
+        report.odd(name, f"{len(holes)} gaps in the numbering: {shown}")
 
 
 def describe_rows(
@@ -147,6 +145,4 @@ def suggest_sequences(report: LayoutReport, found: Iterable[str]) -> None:
 
 
 def _files(scans: ScanFiles, chosen: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> str:
-    indices = np.flatnonzero(chosen)
-    shown = ", ".join(f"{scans.names[i]} ({scans.sizes[i]} bytes)" for i in indices[:_SHOWN])
-    return shown + (", ..." if len(indices) > _SHOWN else "")
+    return examples(f"{scans.names[i]} ({scans.sizes[i]} bytes)" for i in np.flatnonzero(chosen))

@@ -116,7 +116,7 @@ class Nclt(DataSetOnDisk):
         layout.refuse_deskew(self.title, self.deskew)
         scans = self._scans(name)
         if not len(scans):
-            raise self.not_found(name, f"{name}/velodyne_sync/*.bin")
+            raise self.not_found(name, f"{name}/velodyne_sync/*.bin{scans.misnamed}")
         ground_truth = self._ground_truth_file(name)
         truth = None if ground_truth is None else read_ground_truth(ground_truth)
         if truth is not None:
@@ -160,7 +160,7 @@ class Nclt(DataSetOnDisk):
             report.found(name, f"ground truth in {ground_truth.relative_to(self.root)}")
 
     def _scans(self, name: str) -> ScanFiles:
-        return list_scans(self.root / name / "velodyne_sync", (".bin",), r"\d+")
+        return list_scans(self.root / name / "velodyne_sync", (".bin",), r"\d+", "1326030975726043.bin")
 
     def _ground_truth_file(self, name: str) -> Path | None:
         candidates = (folder / f"groundtruth_{name}.csv" for folder in (self.root / name, self.root / "ground_truth"))
