@@ -136,8 +136,14 @@ class KittiRaw(DataSetOnDisk):
 
     def sequence(self, name: str) -> KittiRawSequence:
         """Open a drive, or the part of one that is a sequence of KITTI odometry."""
+        return self._open(name, self._scans(name).first(self.max_frames))
+
+    def open_for_check(self, name: str) -> KittiRawSequence:
+        """Open a drive of one scan: a long one has thousands of GPS/IMU packets, a file each."""
+        return self._open(name, self._scans(name).first(1))
+
+    def _open(self, name: str, scans: ScanFiles) -> KittiRawSequence:
         folder = self._folder(name)
-        scans = self._scans(name).first(self.max_frames)
         if not len(scans):
             raise self._lacking(name, folder / "velodyne_points" / "data" / f"*.bin{scans.misnamed}")
         warn_of_gaps(name, scans)

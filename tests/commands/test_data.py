@@ -127,9 +127,11 @@ def test_no_data_set_takes_no_scans_for_a_number_of_scans(capsys, name, count):
     assert code == 1 and f"data.max_frames={count}" in printed and "at least 1" in printed
 
 
-def test_a_simulated_drive_needs_a_scan(capsys):
-    code, printed = run(capsys, "check", "data=simulated_urban", "data.frames=0")
-    assert code == 1 and "data.frames" in printed and "at least 1" in printed
+@pytest.mark.parametrize("count", ["0", "null"])
+def test_a_simulated_drive_needs_a_scan(count):
+    command = [sys.executable, "-m", "lidarlearn.data", "check", "data=simulated_urban", f"data.frames={count}"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)  # here, hints of types are checked, too
+    assert done.returncode == 1 and f"error: data.frames={count}:" in done.stdout and "at least 1" in done.stdout
 
 
 @pytest.mark.parametrize("name", data_groups())
