@@ -207,8 +207,7 @@ class Rosbag(DataSetOnDisk):
             path = find_ground_truth(bag.path, name)
             describe_ground_truth(report, name, path)
             if path is not None:
-                ends = [_header_s(message) or 1e-9 * time_ns for time_ns, message in bag.ends(clouds.name)]
-                describe_coverage(report, name, read_ground_truth(path), clouds.count, ends[0], ends[1])
+                describe_coverage(report, name, read_ground_truth(path), clouds.count, *_ends_s(bag, clouds))
         except UserError as problem:
             report.missing(name, one_line(problem))
 
@@ -261,6 +260,14 @@ def _middle_s(
         return 0.0
     period_s = float(timestamps.diff().median()) if len(timestamps) > 1 else _PERIOD_S
     return middle_after_stamp(times, None if recorded else float(timestamps[amid]), period_s)
+
+
+def _ends_s(bag: Bag, topic: Topic) -> tuple[float, float]:
+    """Times of the first and the last cloud [s]: those of the headers, or where these do not ascend, of recording."""
+    (first_ns, first), (last_ns, last) = bag.ends(topic.name)
+    first_s, last_s = _header_s(first), _header_s(last)
+    usable = first_s < last_s or (topic.count == 1 and first_s > 0)
+    return (first_s, last_s) if usable else (1e-9 * first_ns, 1e-9 * last_ns)
 
 
 def _header_s(message: Any) -> float:

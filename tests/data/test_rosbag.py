@@ -340,7 +340,9 @@ def test_recorded_times_are_after_the_sweep(tmp_path):
     rows = [as_rows(random_points(0), OUSTER, t=TIMES_NS)] * 3
     write_bag(tmp_path, "street", {"/points": rows}, stamps=np.zeros(3))
     expected = 1.6e9 + 0.003 - 0.0495 + 0.1 * np.arange(3)
+    (tmp_path / "street.tum").write_text(tum_rows(curve(3), 1.6e9 + np.arange(3)))
     assert np.allclose(rosbag(tmp_path).sequence("street").timestamps, expected, rtol=0, atol=1e-6)
+    assert rosbag(tmp_path).check().usable
 
 
 @pytest.mark.parametrize("kind", KINDS)
