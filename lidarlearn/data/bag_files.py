@@ -33,7 +33,7 @@ def find_bags(root: Path) -> dict[str, Path]:
 
     A bag is named like its folder, or its file without the suffix; with it where two would share a name.
     """
-    if _is_file(root) or (root / _METADATA).is_file():
+    if _is_file(root) or os.path.isfile(root / _METADATA):
         return {bag_name(root): root}
     files = list_scans(root, SUFFIXES)
     bags = [files.path(i) for i in range(len(files))]
@@ -212,7 +212,7 @@ class Bag:
 
 
 def _is_file(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and path.is_file()
+    return path.suffix.lower() in SUFFIXES and os.path.isfile(path)  # false where we may not look
 
 
 def _reader(part: Path) -> Any:

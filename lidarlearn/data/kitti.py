@@ -19,6 +19,7 @@ from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import as_transforms, read_kitti_poses, read_lines, read_numbers, start_at_identity
 from lidarlearn.data.scan_files import (
     ScanFiles,
+    is_folder,
     list_scans,
     read_float32_rows,
     subfolders,
@@ -122,7 +123,7 @@ class KittiOdometry(DataSetOnDisk):
     @staticmethod
     def is_root(path: Path) -> bool:
         """Whether it holds `sequences`."""
-        return (path / "sequences").is_dir()
+        return is_folder(path / "sequences")
 
     def found(self) -> dict[str, ScanFiles]:
         """All folders of `sequences`."""

@@ -30,7 +30,7 @@ from lidarlearn.data.pose_files import (
     require_finite,
     start_at_identity,
 )
-from lidarlearn.data.scan_files import ScanFiles, list_scans, read_float32_rows, subfolders
+from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, read_float32_rows, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 
@@ -136,7 +136,7 @@ class Kitti360(DataSetOnDisk):
     @staticmethod
     def is_root(path: Path) -> bool:
         """Whether it holds `data_3d_raw`."""
-        return (path / "data_3d_raw").is_dir()
+        return is_folder(path / "data_3d_raw")
 
     def found(self) -> dict[str, ScanFiles]:
         """All drives."""

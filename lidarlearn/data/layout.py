@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarlearn.data.errors import ROOT_REMEDY
-from lidarlearn.data.scan_files import ScanFiles, examples, gaps, subfolders
+from lidarlearn.data.scan_files import ScanFiles, examples, gaps, is_folder, subfolders
 from lidarlearn.data.sequence import LayoutReport
 from lidarlearn.errors import UserError
 
@@ -17,7 +17,7 @@ def find_root(root: Path, is_root: Callable[[Path], bool]) -> Path | None:
 
     None where there is no such folder, or where `root` itself is not there: its surroundings say nothing then.
     """
-    if not root.is_dir():
+    if not is_folder(root):
         return None
     below = subfolders(root)
     grandchildren = (path for folder in below for path in subfolders(folder))
@@ -46,7 +46,7 @@ def describe_root(report: LayoutReport, root: Path, is_root: Callable[[Path], bo
         report.missing("root", f"wrong folder level: {root} holds no {marker}, but {near} does")
         report.remedy = f"data.root={near}"
     else:
-        report.missing("root", f"{root} holds no {marker}" if root.is_dir() else f"{root}: no such folder")
+        report.missing("root", f"{root} holds no {marker}" if is_folder(root) else f"{root}: no such folder")
         report.remedy = f"{ROOT_REMEDY}; get the data from {source}"
     return False
 

@@ -121,6 +121,11 @@ def subfolders(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: natural_key(path.name))
 
 
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder, as far as we may look: `Path.is_dir` raises PermissionError where we may not."""
+    return os.path.isdir(path)
+
+
 def _entries(folder: Path) -> list["os.DirEntry[str]"]:
     """What a folder holds; nothing where it is absent or closed to us."""
     try:

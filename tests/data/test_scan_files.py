@@ -1,5 +1,4 @@
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,20 +28,21 @@ def test_a_folder_that_is_closed_to_us_holds_nothing(name, tmp_path, monkeypatch
     (tmp_path / "lost+found").mkdir()
 
     def closed(look):
-        def looks(path, *args):
+        def looks(path, **options):
             if "lost+found" in str(path):
                 raise PermissionError(13, "Permission denied", str(path))
-            return look(path, *args)
+            return look(path, **options)
 
         return looks
 
     access = os.access
     monkeypatch.setattr(os, "access", lambda path, mode: "lost+found" not in str(path) and access(path, mode))
     monkeypatch.setattr(os, "scandir", closed(os.scandir))
-    monkeypatch.setattr(Path, "stat", closed(Path.stat))
-    with pytest.raises(SystemExit) as exited:
-        main(["check", f"data={name}", f"data.root={tmp_path}"])
-    assert exited.value.code == 1 and "NOT usable" in capsys.readouterr().out
+    monkeypatch.setattr(os, "stat", closed(os.stat))
+    for root in (tmp_path, tmp_path / "lost+found", tmp_path / "lost+found" / "closed"):
+        with pytest.raises(SystemExit) as exited:
+            main(["check", f"data={name}", f"data.root='{root}'"])
+        assert exited.value.code == 1 and "NOT usable" in capsys.readouterr().out
     assert not len(list_scans(tmp_path / "lost+found", (".bin",)))
 
 
