@@ -13,6 +13,10 @@ FILES = {
     "package/angles.py": "from package.reader import x  # a circle\n",
     "package/far.py": "",
     "package/other.py": "",
+    "package/data/writer.py": "from . import layout\nfrom .. import near\nfrom ..deep.er import x\n",
+    "package/near.py": "",
+    "package/deep/__init__.py": "",
+    "package/deep/er.py": "",
 }
 
 
@@ -44,9 +48,33 @@ def test_a_digest_follows_the_imports(package, changed, matters, matters_within_
         return source_digest(start, within=package), source_digest(start, within=package / "data")
 
     before = digests()
-    (package / changed).write_text((package / changed).read_text() + "# changed\n")
+    (package / changed).write_text((package / changed).read_text() + "changed = 1\n")
     after = digests()
     assert [a != b for a, b in zip(before, after, strict=True)] == [matters, matters_within_data]
+
+
+def test_relative_imports_are_followed(package):
+    found = module._with_imports((package / "data" / "writer.py",), package)
+    assert {path.name for path in found} >= {"layout.py", "near.py", "er.py", "far.py"}
+    assert "other.py" not in {path.name for path in found}
+
+
+@pytest.mark.parametrize(
+    ("code", "same"),
+    [
+        ('"""Something else."""\n\n\ndef f(x):  # so\n    """That."""\n    return (x +\n        1)\n', True),
+        ('def f(x):\n    return x + 1\nclass A:\n    """Bare."""\n', False),
+        ("def f(x):\n    return x + 2\n", False),
+        ('def f(x):\n    "one"\n    "two"\n    return x + 1\n', False),
+    ],
+)
+def test_words_do_not_count(package, code, same):
+    path, digests = package / "other.py", []
+    for content in ('"""Adds."""\ndef f(x):\n    return x + 1\n', code):
+        path.write_text(content)
+        source_digest.cache_clear()
+        digests.append(source_digest(path))
+    assert (digests[0] == digests[1]) == same
 
 
 @pytest.mark.parametrize(

@@ -61,12 +61,14 @@ def export_all(overrides: Sequence[str], console: Console) -> bool:
     of_target = [o.replace("to", "data", 1) for o in overrides if o.startswith(("to=", "to."))]
     source = compose_data_set([o for o in overrides if not o.startswith(("to=", "to.", "suffix="))])
     target = compose_data_set(of_target)
-    format_of(target, suffix)
+    form = format_of(target, suffix)
     theirs = matched_names(source, target)
     for name in theirs.values():
         require_new(target, name)
     source.prepare(theirs)
     drives = {name: source.sequence(name) for name in theirs}
+    for mine, drive in drives.items():  # all, before the first is written: half an export would be in its own way
+        form.require(drive, target, theirs[mine])
     for mine, drive in drives.items():
         export(drive, target, theirs[mine], suffix)
         console.print(f"{mine} -> {theirs[mine]}: {len(drive)} scans", markup=False)

@@ -5,12 +5,12 @@ such files: the parts into which a recorder has split one recording.
 """
 
 import os
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ from lidarlearn.errors import UserError
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-_METADATA = "metadata.yaml"
+_METADATA, _COMPRESSED = "metadata.yaml", ".zstd"
+_LONGEST_PAUSE_S, _LONGEST_OVERLAP_S = 10.0, 1.0  # from part to part of one recording
 _REPAIR = (
     "copy or download it again, or repair what a recorder left unfinished: `rosbag reindex BAG`,"
     " `ros2 bag reindex FOLDER`, `mcap recover FILE`"
@@ -32,7 +33,7 @@ def find_bags(root: Path) -> dict[str, Path]:
 
     A bag is named like its folder, or its file without the suffix; with it where two would share a name.
     """
-    if _is_file(root) or (root / _METADATA).is_file():
+    if _is_file(root) or os.path.isfile(root / _METADATA):
         return {bag_name(root): root}
     files = list_scans(root, SUFFIXES)
     bags = [files.path(i) for i in range(len(files))]
@@ -51,7 +52,7 @@ def list_files(bag: Path) -> ScanFiles:
     """The files that hold a bag's messages."""
     if _is_file(bag):
         return ScanFiles(bag.parent, (bag.name,), (bag.stat().st_size,))
-    return list_scans(bag, (*SUFFIXES, ".zstd"))
+    return list_scans(bag, (*SUFFIXES, _COMPRESSED))
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,19 @@ class Bag:
         ends = [reader.end_time for reader in readers]
         return 1e-9 * (max(ends) - min(reader.start_time for reader in readers)) if ends else 0.0
 
+    def doubt(self) -> str | None:
+        """What speaks against its parts being those of one recording; None where nothing does."""
+        readers = [reader for reader in self._opened() if reader.message_count]
+        pauses = [1e-9 * (b.start_time - a.end_time) for a, b in pairwise(readers)]
+        odd = [pause for pause in pauses if not -_LONGEST_OVERLAP_S <= pause <= _LONGEST_PAUSE_S]
+        if not odd:
+            return None
+        seen = f"overlap by {-odd[0]:,.0f} s" if odd[0] < 0 else f"are {odd[0]:,.0f} s apart"
+        return (
+            f"{self.path}: its {len(readers)} bags are read as parts of one recording, but two of them {seen};"
+            f" data.root={self.path} reads each as a sequence"
+        )
+
     def cloud_topic(self, wanted: str | None) -> Topic:
         """The topic to read.
 
@@ -142,11 +156,23 @@ class Bag:
         """All PointCloud2 messages of a topic in the order of recording, each with its place."""
         for part, reader in enumerate(self._opened()):
             before, rank = None, 0
+            connections = _connections(reader, topic)
             with _readable(self.path):
-                for _, time_ns, raw in reader.messages(_connections(reader, topic)) if reader.message_count else ():
+                for _, time_ns, raw in reader.messages(connections) if connections else ():  # for none it gives all
                     rank = rank + 1 if time_ns == before else 0
                     before = time_ns
                     yield Place(part, time_ns, rank), _decode(reader, raw)
+
+    def ends(self, topic: str) -> tuple[tuple[int, Any], tuple[int, Any]]:
+        """The first and the last PointCloud2 message of a topic that has some, and when each was recorded [ns]."""
+        place, first = next(self.messages(topic))
+        reader = next(r for r in reversed(self._opened()) if _connections(r, topic))
+        with _readable(self.path):
+            # from the end: reading through a bag takes minutes
+            starts = (*(reader.end_time - seconds * 10**9 for seconds in (1, 10, 100)), None)
+            found = (deque(reader.messages(_connections(reader, topic), start=start), maxlen=1) for start in starts)
+            _, last_ns, raw = next(filter(None, found))[0]
+            return (place.time_ns, first), (last_ns, _decode(reader, raw))
 
     def message(self, topic: str, place: Place) -> Any:
         """One PointCloud2 message."""
@@ -159,14 +185,22 @@ class Bag:
         """Readers of the parts in the order of time."""
         if self._process != os.getpid():
             self._files.close()
+            parts = self._parts()
             with _readable(self.path), ExitStack() as files:
-                readers = [files.enter_context(_reader(path)) for path in self._parts()]
+                readers = [files.enter_context(_reader(path)) for path in parts]
                 self._readers = sorted(readers, key=lambda reader: reader.start_time)
                 self._files, self._process = files.pop_all(), os.getpid()
         return self._readers
 
     def _parts(self) -> list[Path]:
-        if _is_file(self.path) or (self.path / _METADATA).is_file():
+        if _is_file(self.path):
+            return [self.path]
+        if (self.path / _METADATA).is_file():
+            if holds_scans(self.path, (_COMPRESSED,)):  # every process would unpack it, for itself
+                raise UserError(
+                    f"{self.path}: its files are compressed as a whole.\n"
+                    f"  change: unpack it once, `rosbags-convert --src {self.path} --dst NEW_FOLDER`"
+                )
             return [self.path]
         files = list_scans(self.path, SUFFIXES)
         if len(kinds := {Path(name).suffix.lower() for name in files.names}) > 1:
@@ -178,7 +212,7 @@ class Bag:
 
 
 def _is_file(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and path.is_file()
+    return path.suffix.lower() in SUFFIXES and os.path.isfile(path)  # false where we may not look
 
 
 def _reader(part: Path) -> Any:
@@ -193,7 +227,7 @@ def _reader(part: Path) -> Any:
 
 
 def _connections(reader: Any, topic: str) -> list[Any]:
-    return [c for c in reader.connections if (c.topic, c.msgtype) == (topic, POINT_CLOUD)]
+    return [c for c in reader.connections if (c.topic, c.msgtype) == (topic, POINT_CLOUD) and c.msgcount]
 
 
 def _decode(reader: Any, raw: bytes) -> Any:

@@ -48,7 +48,9 @@ def one_line(message: object) -> str:
     return " ".join(line.strip() for line in str(message).splitlines())
 
 
-def require_count(setting: str, value: int | None) -> None:
-    """Raise UserError unless a setting is an integer of at least 1, or None."""
-    if value is not None and (not isinstance(value, int) or value < 1):
-        raise UserError(f"{setting}={value}: nothing would be left.\n  change: {setting} to an integer of at least 1")
+def require_count(setting: str, value: int | None, optional: bool = False) -> None:
+    """Raise UserError unless a setting is an integer of at least 1, or None where that is allowed."""
+    if (value is None and optional) or (isinstance(value, int) and value >= 1):
+        return
+    seen = "null" if value is None else value
+    raise UserError(f"{setting}={seen}: no number of scans.\n  change: {setting} to an integer of at least 1")

@@ -3,8 +3,8 @@
 On disk: either every subfolder with scans in it is a sequence, or the folder itself is one. Beside its scans a sequence
 may have `times.txt` (a time [s] per scan) and ground truth of the LiDAR's own poses, in KITTI's or TUM's format:
 `poses.txt`, `poses.tum`, `groundtruth.txt` with the scans, or `<sequence>.txt`, `<sequence>.tum` beside its folder.
-KITTI rows belong to the scans in order; TUM rows are interpolated at the scans' times, or belong to the scans in order
-where these have no times. Poses relate to the middle of a sweep.
+KITTI rows belong to the scans in order; TUM rows are interpolated at the scans' times, where scans before or after them
+are left out, or belong to the scans in order where these have no times. Poses relate to the middle of a sweep.
 """
 
 from dataclasses import dataclass
@@ -108,7 +108,7 @@ class Folder(DataSetOnDisk):
         self.max_intensity = None if max_intensity is None else float(max_intensity)
 
     def sequence(self, name: str) -> FolderSequence:
-        """Open a folder of scans."""
+        """Open a folder of scans; those that stamped ground truth does not cover are left out."""
         folder = self._folder(name)
         files = list_scans(folder, SUFFIXES)
         if not len(files):
@@ -120,14 +120,15 @@ class Folder(DataSetOnDisk):
         if self.deskew and read_cloud(files.path(0), self.bin_columns).times is None:
             raise UserError(f"{files.path(0)}: no point times to deskew with.\n  change: data.deskew=false")
         timestamps = _timestamps(folder, len(files))
-        truth = find_ground_truth(folder)
-        poses = None if truth is None else read_ground_truth(truth, len(files), timestamps)
-        scans = files.first(self.max_frames)
+        posed, truth = None, find_ground_truth(folder)
+        if truth is not None:
+            posed = read_ground_truth(truth).of_scans(name, range(len(files)), len(files), timestamps)
+        chosen = (range(len(files)) if posed is None else posed.indices)[: self.max_frames]
         return FolderSequence(
             name=name,
-            scans=scans,
-            T_world_lidar=None if poses is None else poses[: len(scans)],
-            timestamps=None if timestamps is None else timestamps[: len(scans)],
+            scans=files.select(chosen),
+            T_world_lidar=None if posed is None else posed.T_world_lidar[: len(chosen)],
+            timestamps=None if timestamps is None else timestamps[list(chosen)],
             bin_columns=self.bin_columns,
             max_intensity=self.max_intensity,
             beam_correction_deg=self.beam_correction_deg,

@@ -141,7 +141,7 @@ class FordCampus(DataSetOnDisk):
     ) -> FordCampusSequence:
         layout.refuse_deskew(self.title, self.deskew)
         if not len(scans):
-            raise self.not_found(name, f"{name}/SCANS/Scan*.mat")
+            raise self.not_found(name, f"{name}/SCANS/Scan*.mat{scans.misnamed}")
         warn_of_gaps(name, scans)
         stamped = read(name, scans)
         T_world_vehicle = _from_degrees(np.concatenate([stamped[:, 1:4], np.degrees(stamped[:, 4:])], axis=1))
@@ -155,7 +155,7 @@ class FordCampus(DataSetOnDisk):
         )
 
     def _scans(self, name: str) -> ScanFiles:
-        return list_scans(self.root / name / "SCANS", (".mat",), r"Scan\d+")
+        return list_scans(self.root / name / "SCANS", (".mat",), r"Scan\d+", "Scan0001.mat")
 
     @staticmethod
     def is_root(path: Path) -> bool:

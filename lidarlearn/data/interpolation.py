@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data.scan_files import ScanFiles
 from lidarlearn.geometry import se3
 
 _log = logging.getLogger(__name__)
@@ -32,17 +31,17 @@ def interpolate_poses(
 
 
 def covered(
-    name: str, scans: ScanFiles, timestamps: Float[Tensor, "n"], truth_timestamps: Float[Tensor, "m"]
-) -> ScanFiles:
-    """The scans within the time of the ground truth; says how many are not, or lie in a hole of it.
+    name: str, timestamps: Float[Tensor, "n"], truth_timestamps: Float[Tensor, "m"], slack_s: float = 0.0
+) -> list[int]:
+    """Which scans lie within the time of the ground truth; says how many do not, or lie in a hole of it.
 
     Args:
         name: of the sequence.
-        scans: its files.
         timestamps: of the scans [s].
         truth_timestamps: of the ground-truth poses [s], ascending, at least two.
+        slack_s: by which a scan may be before the first or after the last pose [s].
     """
-    inside = (timestamps >= truth_timestamps[0]) & (timestamps <= truth_timestamps[-1])
+    inside = (timestamps >= truth_timestamps[0] - slack_s) & (timestamps <= truth_timestamps[-1] + slack_s)
     if not inside.all():
         _log.warning("%s: %d scans before or after the ground truth are left out", name, int((~inside).sum()))
     after = torch.searchsorted(truth_timestamps, timestamps).clamp(1, len(truth_timestamps) - 1)
@@ -51,4 +50,4 @@ def covered(
         _log.warning(
             "%s: %d scans lie in holes of the ground truth longer than %g s", name, int(in_hole.sum()), _LONGEST_GAP_S
         )
-    return scans.select(np.flatnonzero(inside.numpy()).tolist())
+    return np.flatnonzero(inside.numpy()).tolist()

@@ -19,6 +19,7 @@ from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import as_transforms, read_kitti_poses, read_lines, read_numbers, start_at_identity
 from lidarlearn.data.scan_files import (
     ScanFiles,
+    is_folder,
     list_scans,
     read_float32_rows,
     subfolders,
@@ -105,7 +106,7 @@ class KittiOdometry(DataSetOnDisk):
         folder = self.root / "sequences" / name
         scans = self._scans(name).first(self.max_frames)
         if not len(scans):
-            raise self.not_found(name, f"sequences/{name}/velodyne/*.bin")
+            raise self.not_found(name, f"sequences/{name}/velodyne/*.bin{scans.misnamed}")
         if not (folder / "calib.txt").is_file():
             raise self.not_found(name, f"sequences/{name}/calib.txt")
         warn_of_gaps(name, scans)
@@ -122,7 +123,7 @@ class KittiOdometry(DataSetOnDisk):
     @staticmethod
     def is_root(path: Path) -> bool:
         """Whether it holds `sequences`."""
-        return (path / "sequences").is_dir()
+        return is_folder(path / "sequences")
 
     def found(self) -> dict[str, ScanFiles]:
         """All folders of `sequences`."""
@@ -145,7 +146,7 @@ class KittiOdometry(DataSetOnDisk):
             layout.describe_rows(report, name, poses, "poses", rows_needed, needed=name in self.test_sequences)
 
     def _scans(self, name: str) -> ScanFiles:
-        return list_scans(self.root / "sequences" / name / "velodyne", (".bin",), r"\d{6}")
+        return list_scans(self.root / "sequences" / name / "velodyne", (".bin",), r"\d{6}", "000000.bin")
 
     def _ground_truth(
         self, name: str, scans: ScanFiles, T_camera_lidar: Float[Tensor, "4 4"]

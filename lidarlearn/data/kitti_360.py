@@ -30,7 +30,7 @@ from lidarlearn.data.pose_files import (
     require_finite,
     start_at_identity,
 )
-from lidarlearn.data.scan_files import ScanFiles, list_scans, read_float32_rows, subfolders
+from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, read_float32_rows, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 
@@ -108,13 +108,14 @@ class Kitti360(DataSetOnDisk):
         """Open a drive; scans before its first and after its last pose are left out."""
         scans = self._scans(name)
         if not len(scans):
-            raise self.not_found(name, f"data_3d_raw/{drive_folder(name)}/velodyne_points/data/*.bin")
+            raise self.not_found(name, f"data_3d_raw/{drive_folder(name)}/velodyne_points/data/*.bin{scans.misnamed}")
         stamps = self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "timestamps.txt"
         if not stamps.is_file():
             raise self.not_found(name, str(stamps.relative_to(self.root)))
         truth = self._poses(name, stamps)
         if truth is not None:
-            scans = covered(name, scans, read_timestamps(stamps, scans.numbers), truth.timestamps)
+            times = read_timestamps(stamps, scans.numbers)
+            scans = scans.select(covered(name, times, truth.timestamps))
         scans = scans.first(self.max_frames)
         if not len(scans):
             raise DamagedFileError(self._poses_file(name), f"its poses belong to none of the scans of {name}")
@@ -135,7 +136,7 @@ class Kitti360(DataSetOnDisk):
     @staticmethod
     def is_root(path: Path) -> bool:
         """Whether it holds `data_3d_raw`."""
-        return (path / "data_3d_raw").is_dir()
+        return is_folder(path / "data_3d_raw")
 
     def found(self) -> dict[str, ScanFiles]:
         """All drives."""
@@ -162,9 +163,8 @@ class Kitti360(DataSetOnDisk):
             note(name, f"no ground truth: no {poses.relative_to(self.root)}")
 
     def _scans(self, name: str) -> ScanFiles:
-        return list_scans(
-            self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "data", (".bin",), r"\d{10}"
-        )
+        folder = self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "data"
+        return list_scans(folder, (".bin",), r"\d{10}", "0000000000.bin")
 
     def _poses_file(self, name: str) -> Path:
         return self.root / "data_poses" / drive_folder(name) / "poses.txt"

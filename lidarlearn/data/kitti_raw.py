@@ -136,10 +136,16 @@ class KittiRaw(DataSetOnDisk):
 
     def sequence(self, name: str) -> KittiRawSequence:
         """Open a drive, or the part of one that is a sequence of KITTI odometry."""
+        return self._open(name, self._scans(name).first(self.max_frames))
+
+    def open_for_check(self, name: str) -> KittiRawSequence:
+        """Open a drive of one scan: a long one has thousands of GPS/IMU packets, a file each."""
+        return self._open(name, self._scans(name).first(1))
+
+    def _open(self, name: str, scans: ScanFiles) -> KittiRawSequence:
         folder = self._folder(name)
-        scans = self._scans(name).first(self.max_frames)
         if not len(scans):
-            raise self._lacking(name, folder / "velodyne_points" / "data" / "*.bin")
+            raise self._lacking(name, folder / "velodyne_points" / "data" / f"*.bin{scans.misnamed}")
         warn_of_gaps(name, scans)
         timestamps = self._timestamps(name, scans)
         return KittiRawSequence(
@@ -190,7 +196,7 @@ class KittiRaw(DataSetOnDisk):
 
     def _scans(self, name: str) -> ScanFiles:
         drive = _drive(name)
-        scans = list_scans(self._folder(name) / "velodyne_points" / "data", (".bin",), r"\d{10}")
+        scans = list_scans(self._folder(name) / "velodyne_points" / "data", (".bin",), r"\d{10}", "0000000000.bin")
         last = math.inf if drive.last is None else drive.last
         return scans.select(i for i, number in enumerate(scans.numbers) if drive.first <= number <= last)
 

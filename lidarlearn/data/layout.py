@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from lidarlearn.data.errors import ROOT_REMEDY
-from lidarlearn.data.scan_files import ScanFiles, gaps, subfolders
+from lidarlearn.data.scan_files import ScanFiles, examples, gaps, is_folder, subfolders
 from lidarlearn.data.sequence import LayoutReport
 from lidarlearn.errors import UserError
-
-_SHOWN = 5  # so many examples are listed before "..."
 
 
 def find_root(root: Path, is_root: Callable[[Path], bool]) -> Path | None:
@@ -19,7 +17,7 @@ def find_root(root: Path, is_root: Callable[[Path], bool]) -> Path | None:
 
     None where there is no such folder, or where `root` itself is not there: its surroundings say nothing then.
     """
-    if not root.is_dir():
+    if not is_folder(root):
         return None
     below = subfolders(root)
     grandchildren = (path for folder in below for path in subfolders(folder))
@@ -48,7 +46,7 @@ def describe_root(report: LayoutReport, root: Path, is_root: Callable[[Path], bo
         report.missing("root", f"wrong folder level: {root} holds no {marker}, but {near} does")
         report.remedy = f"data.root={near}"
     else:
-        report.missing("root", f"{root} holds no {marker}" if root.is_dir() else f"{root}: no such folder")
+        report.missing("root", f"{root} holds no {marker}" if is_folder(root) else f"{root}: no such folder")
         report.remedy = f"{ROOT_REMEDY}; get the data from {source}"
     return False
 
@@ -72,11 +70,11 @@ def describe_scans(
         smallest_bytes: below which a file cannot hold a scan.
     """
     if not len(scans):
-        report.missing(name, f"no scans in {scans.folder}")
+        report.missing(name, f"no scans in {scans.folder}{scans.misnamed}")
         return
     report.found(name, f"{len(scans)} scans, {scans.names[0]} to {scans.names[-1]}")
     if scans.others:
-        shown = ", ".join(map(repr, scans.others[:_SHOWN])) + (", ..." if len(scans.others) > _SHOWN else "")
+        shown = examples(map(repr, scans.others))
         report.odd(name, f"{len(scans.others)} files that are not named like scans are left out: {shown}")
     sizes = np.array(scans.sizes)
     broken = (sizes < smallest_bytes) | (sizes % (bytes_per_point or 1) != 0)
@@ -86,8 +84,8 @@ def describe_scans(
     if small.any():
         report.odd(name, f"{small.sum()} files less than a quarter of the usual size: {_files(scans, small)}")
     if numbered and (holes := gaps(scans.numbers)):
-        shown = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in holes[:_SHOWN])
-        report.odd(name, f"{len(holes)} gaps in the numbering: {shown}{', ...' if len(holes) > _SHOWN else ''}")
+        shown = examples(str(a) if a == b else f"{a}-{b}" for a, b in holes)
+        report.odd(name, f"{len(holes)} gaps in the numbering: {shown}")
 
 
 def describe_rows(
@@ -147,6 +145,4 @@ def suggest_sequences(report: LayoutReport, found: Iterable[str]) -> None:
 
 
 def _files(scans: ScanFiles, chosen: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> str:
-    indices = np.flatnonzero(chosen)
-    shown = ", ".join(f"{scans.names[i]} ({scans.sizes[i]} bytes)" for i in indices[:_SHOWN])
-    return shown + (", ..." if len(indices) > _SHOWN else "")
+    return examples(f"{scans.names[i]} ({scans.sizes[i]} bytes)" for i in np.flatnonzero(chosen))

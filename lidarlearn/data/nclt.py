@@ -116,11 +116,11 @@ class Nclt(DataSetOnDisk):
         layout.refuse_deskew(self.title, self.deskew)
         scans = self._scans(name)
         if not len(scans):
-            raise self.not_found(name, f"{name}/velodyne_sync/*.bin")
+            raise self.not_found(name, f"{name}/velodyne_sync/*.bin{scans.misnamed}")
         ground_truth = self._ground_truth_file(name)
         truth = None if ground_truth is None else read_ground_truth(ground_truth)
         if truth is not None:
-            scans = covered(name, scans, _timestamps(scans), truth.timestamps)
+            scans = scans.select(covered(name, _timestamps(scans), truth.timestamps))
         scans = scans.first(self.max_frames)
         if ground_truth is not None and not len(scans):
             raise DamagedFileError(ground_truth, f"its times do not overlap with those of the scans of {name}")
@@ -160,7 +160,7 @@ class Nclt(DataSetOnDisk):
             report.found(name, f"ground truth in {ground_truth.relative_to(self.root)}")
 
     def _scans(self, name: str) -> ScanFiles:
-        return list_scans(self.root / name / "velodyne_sync", (".bin",), r"\d+")
+        return list_scans(self.root / name / "velodyne_sync", (".bin",), r"\d+", "1326030975726043.bin")
 
     def _ground_truth_file(self, name: str) -> Path | None:
         candidates = (folder / f"groundtruth_{name}.csv" for folder in (self.root / name, self.root / "ground_truth"))

@@ -110,11 +110,11 @@ class NewerCollege(DataSetOnDisk):
         """Open a walk; scans before and after its ground truth are left out."""
         scans = _scans(self.root / name)
         if not len(scans):
-            raise self.not_found(name, f"{name}/raw_format/ouster_scan/cloud_*.pcd")
+            raise self.not_found(name, f"{name}/raw_format/ouster_scan/cloud_*.pcd{scans.misnamed}")
         truth_file = self._truth_file(name)
         truth = read_registered_poses(truth_file) if truth_file.is_file() else None
         if truth is not None:
-            scans = covered(name, scans, _middles(scans), truth.timestamps)
+            scans = scans.select(covered(name, _middles(scans), truth.timestamps))
         scans = scans.first(self.max_frames)
         if not len(scans):
             raise DamagedFileError(truth_file, f"its times do not overlap with those of the scans of {name}")
@@ -173,7 +173,7 @@ def read_registered_poses(path: Path) -> StampedPoses:
 
 
 def _scans(walk: Path) -> ScanFiles:
-    return list_scans(_scan_folder(walk), (".pcd",), r"cloud_\d+_\d+")
+    return list_scans(_scan_folder(walk), (".pcd",), r"cloud_\d+_\d+", "cloud_1583836591_182590976.pcd")
 
 
 def _middles(scans: ScanFiles) -> Float[Tensor, "n"]:

@@ -40,7 +40,10 @@ class DataSetOnDisk(DataSet):
         return self.sequence(name)
 
     def check(self) -> LayoutReport:
-        """Describe this copy by names and sizes; where these are in order, open each configured sequence."""
+        """Describe this copy by names and sizes; where these are in order, open each configured sequence.
+
+        Opening reads times, poses and calibration as far as `open_for_check` goes, and the first scan.
+        """
         report = LayoutReport()
         if layout.describe_root(report, self.root, self.is_root, self.marker, self.source):
             found = self._whole()

@@ -2,14 +2,18 @@
 
 On disk: every bag in a folder is a sequence, or the root is one bag itself; see `bag_files` for what is a bag. Beside
 it, or in its folder, there may be ground truth of the LiDAR's own poses as with `folder`: `<sequence>.tum` is
-interpolated at the scans' times. A scan's time is the one in its message's header, by convention that of its first
-point; where those do not ascend, the one at which it was recorded. Messages without points are passed over.
+interpolated at the scans' times. A scan's time is the one in its message's header; where its points have times, which
+tell how long after that the middle of the sweep is, it is that of the middle, to which poses relate. A few clouds with
+a time out of order are left out; where most times are, those of recording take their place. Messages without points
+are passed over.
 """
 
 import hashlib
 import logging
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -18,16 +22,43 @@ from torch import Tensor
 from lidarlearn.data.bag_files import Bag, Place, Topic, bag_name, find_bags, list_files
 from lidarlearn.data.cloud_files import as_scan, returns_of
 from lidarlearn.data.errors import DamagedFileError, one_line
-from lidarlearn.data.ground_truth import describe_ground_truth, find_ground_truth, read_ground_truth
+from lidarlearn.data.ground_truth import (
+    GroundTruth,
+    describe_coverage,
+    describe_ground_truth,
+    find_ground_truth,
+    read_ground_truth,
+)
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.point_cloud2 import fields_of
 from lidarlearn.data.progress import tracked
 from lidarlearn.data.scan_files import ScanFiles
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sweep_stamps import ascending, middle_after_stamp
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 
 _log = logging.getLogger(__name__)
+
+_LEAST_ASCENDING = 0.9  # of the headers' times, for them to be used
+_PERIOD_S = 0.1  # of a sweep where there is but one
+
+
+@dataclass(frozen=True)
+class _Clouds:
+    """Clouds of a topic whose times ascend.
+
+    Args:
+        places: where in the bag each is.
+        timestamps: of each [s].
+        rows: the rank of each among all clouds.
+        count: of all clouds; None where not all were read.
+    """
+
+    places: tuple[Place, ...]
+    timestamps: Float[Tensor, "n"]
+    rows: list[int]
+    count: int | None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,7 +71,7 @@ class RosbagSequence(Sequence):
         topic: the clouds' name.
         places: where in the bag each cloud is.
         T_world_lidar: ground truth; None where there is none.
-        timestamps: of each cloud [s].
+        timestamps: of the middle of each sweep [s]; of its message where points have no times.
         max_intensity: the value of full reflectance; None leaves intensities out.
         beam_correction_deg: angle by which every beam is raised.
     """
@@ -122,26 +153,30 @@ class Rosbag(DataSetOnDisk):
     def sequence(self, name: str) -> RosbagSequence:
         """Open a bag and read through its clouds for their times, the first time that it is asked for."""
         if name not in self._sequences:
-            self._sequences[name] = self._open(name, self.max_frames)
+            bag = self._bag(name)
+            if doubt := bag.doubt():
+                _log.warning("%s: %s", name, doubt)
+            path = find_ground_truth(bag.path, name)
+            truth = None if path is None else read_ground_truth(path)
+            self._sequences[name] = self._open(name, bag, self.max_frames, truth)
         return self._sequences[name]
 
     def open_for_check(self, name: str) -> RosbagSequence:
-        """Open a bag as if it had one cloud: reading through all takes minutes."""
-        return self._open(name, 1)
+        """Open a bag as if it had one cloud and no ground truth: reading through all takes minutes."""
+        return self._open(name, self._bag(name), 1, None)
 
-    def _open(self, name: str, max_frames: int | None) -> RosbagSequence:
-        bag = self._bag(name)
+    def _open(self, name: str, bag: Bag, max_frames: int | None, truth: GroundTruth | None) -> RosbagSequence:
         topic = bag.cloud_topic(self.topic)
-        places, timestamps, empty = _read_times(name, bag, topic, max_frames)
-        path = find_ground_truth(bag.path, bag_name(bag.path))
-        poses = None if path is None else read_ground_truth(path, topic.count - empty, timestamps)
+        clouds = _read_clouds(name, bag, topic, max_frames, -math.inf if truth is None else truth.start_s)
+        posed = None if truth is None else truth.of_scans(name, clouds.rows, clouds.count, clouds.timestamps)
+        chosen = list(range(len(clouds.places)) if posed is None else posed.indices)[:max_frames]
         sequence = RosbagSequence(
             name=name,
             bag=bag,
             topic=topic.name,
-            places=places,
-            T_world_lidar=None if poses is None else poses[: len(places)],
-            timestamps=timestamps,
+            places=tuple(clouds.places[i] for i in chosen),
+            T_world_lidar=None if posed is None else posed.T_world_lidar[: len(chosen)],
+            timestamps=clouds.timestamps[chosen],
             max_intensity=self.max_intensity,
             beam_correction_deg=self.beam_correction_deg,
         )
@@ -166,11 +201,15 @@ class Rosbag(DataSetOnDisk):
             report.found(name, f"{bag.path}: {size / 1e6:,.1f} MB, {bag.duration_s():.1f} s")
             for topic in bag.topics():
                 report.found(name, f"topic {topic}")
-            bag.cloud_topic(self.topic)
+            if doubt := bag.doubt():
+                report.odd(name, doubt)
+            clouds = bag.cloud_topic(self.topic)
+            path = find_ground_truth(bag.path, name)
+            describe_ground_truth(report, name, path)
+            if path is not None:
+                describe_coverage(report, name, read_ground_truth(path), clouds.count, *_ends_s(bag, clouds))
         except UserError as problem:
             report.missing(name, one_line(problem))
-            return
-        describe_ground_truth(report, name, find_ground_truth(bag.path, bag_name(bag.path)))
 
     def _bag(self, name: str) -> Bag:
         bags = find_bags(self.root)
@@ -179,26 +218,57 @@ class Rosbag(DataSetOnDisk):
         return Bag(bags[name])
 
 
-def _read_times(
-    name: str, bag: Bag, topic: Topic, max_frames: int | None
-) -> tuple[tuple[Place, ...], Float[Tensor, "n"], int]:
-    """Places and times [s] of the first clouds, and how many messages without points were passed over."""
+def _read_clouds(name: str, bag: Bag, topic: Topic, max_frames: int | None, start_s: float) -> _Clouds:
+    """The first clouds; of those stamped before `start_s` as many more as there are."""
     messages = bag.messages(topic.name)
     if max_frames != 1:  # one is there at once
         messages = tracked(messages, f"reading the times of {name}", min(topic.count, max_frames or topic.count))
-    places, stamps, empty = [], [], 0
+    places, stamps, wanted = [], [], 0
     for place, message in messages:
         if message.width * message.height == 0:
-            empty += 1
             continue
         places.append(place)
-        stamps.append(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
-        if len(places) == max_frames:
+        stamps.append(_header_s(message))
+        wanted += (stamps[-1] or 1e-9 * place.time_ns) >= start_s
+        if wanted == max_frames:
             break
     if not places:
         raise DamagedFileError(bag.path, f"no message of {topic.name} has points")
-    timestamps = torch.tensor(stamps, dtype=torch.float64)
-    if (timestamps.diff() <= 0).any():
+    rows = ascending(stamps)
+    if recorded := len(rows) < _LEAST_ASCENDING * len(stamps):
         _log.warning("%s: the times in the headers of %s do not ascend, those of recording are used", name, topic.name)
-        timestamps = 1e-9 * torch.tensor([place.time_ns for place in places], dtype=torch.float64)
-    return tuple(places), timestamps, empty
+        rows, stamps = list(range(len(places))), [1e-9 * place.time_ns for place in places]
+    elif len(rows) < len(stamps):
+        left_out = len(stamps) - len(rows)
+        _log.warning("%s: %d clouds of %s with a time out of order are left out", name, left_out, topic.name)
+    timestamps = torch.tensor([stamps[row] for row in rows], dtype=torch.float64)
+    chosen = tuple(places[row] for row in rows)
+    timestamps = timestamps + _middle_s(bag, topic, chosen, timestamps, recorded)
+    return _Clouds(chosen, timestamps, rows, None if wanted == max_frames else len(places))
+
+
+def _middle_s(
+    bag: Bag, topic: Topic, places: tuple[Place, ...], timestamps: Float[Tensor, "n"], recorded: bool
+) -> float:
+    """How long after its time the middle of a sweep is [s], from one amid the recording: drivers begin with a part."""
+    amid = len(places) // 2
+    try:
+        times = returns_of(fields_of(bag.message(topic.name, places[amid]))).times
+    except ValueError:  # whoever reads that scan is told
+        return 0.0
+    if times is None or not (times != times[0]).any():
+        return 0.0
+    period_s = float(timestamps.diff().median()) if len(timestamps) > 1 else _PERIOD_S
+    return middle_after_stamp(times, None if recorded else float(timestamps[amid]), period_s)
+
+
+def _ends_s(bag: Bag, topic: Topic) -> tuple[float, float]:
+    """Times of the first and the last cloud [s]: those of the headers, or where these do not ascend, of recording."""
+    (first_ns, first), (last_ns, last) = bag.ends(topic.name)
+    first_s, last_s = _header_s(first), _header_s(last)
+    usable = first_s < last_s or (topic.count == 1 and first_s > 0)
+    return (first_s, last_s) if usable else (1e-9 * first_ns, 1e-9 * last_ns)
+
+
+def _header_s(message: Any) -> float:
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec

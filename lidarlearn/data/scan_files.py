@@ -20,6 +20,8 @@ from lidarlearn.errors import UserError
 
 _log = logging.getLogger(__name__)
 
+_SHOWN = 5  # so many examples are listed before "..."
+
 
 @dataclass(frozen=True)
 class ScanFiles:
@@ -30,15 +32,24 @@ class ScanFiles:
         names: file names, in natural order: 9 before 10.
         sizes: of each file [bytes].
         others: files of the same kind beside them whose names are not those of scans.
+        like: a name that a scan might have, for whoever finds none; "" where any will do.
     """
 
     folder: Path
     names: tuple[str, ...]
     sizes: tuple[int, ...]
     others: tuple[str, ...] = ()
+    like: str = ""
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def misnamed(self) -> str:
+        """Where no file is a scan, those that might have been meant: " (3 files, none named like ...)" or ""."""
+        if self.names or not self.others:
+            return ""
+        return f" ({len(self.others)} files there, none named like {self.like}: {examples(map(repr, self.others))})"
 
     def path(self, index: int) -> Path:
         """Path of one scan."""
@@ -73,7 +84,7 @@ class ScanFiles:
         return digest.hexdigest()
 
 
-def list_scans(folder: Path, suffixes: tuple[str, ...], stems: str = ".*") -> ScanFiles:
+def list_scans(folder: Path, suffixes: tuple[str, ...], stems: str = ".*", like: str = "") -> ScanFiles:
     """The scan files of a folder, hidden ones left out; none where the folder is absent.
 
     Only names and sizes are looked at, which takes a tenth of a second for 20,000 files.
@@ -82,23 +93,19 @@ def list_scans(folder: Path, suffixes: tuple[str, ...], stems: str = ".*") -> Sc
         folder: where they are.
         suffixes: of their names.
         stems: regular expression of what stands before; a copy `000002 (1).bin` is no scan of KITTI's.
+        like: a name with such a stem.
     """
-    if not folder.is_dir():
-        return ScanFiles(folder, (), ())
-    with os.scandir(folder) as entries:
-        found = [(e.name, e.stat().st_size) for e in entries if _is_scan(e, suffixes)]
+    found = [(e.name, e.stat().st_size) for e in _entries(folder) if _is_scan(e, suffixes)]
     found.sort(key=lambda file: natural_key(file[0]))
     scans = [(name, size) for name, size in found if re.fullmatch(stems, Path(name).stem)]
     others = {name for name, _ in found}.difference(name for name, _ in scans)
-    return ScanFiles(folder, tuple(n for n, _ in scans), tuple(size for _, size in scans), tuple(sorted(others)))
+    names, sizes = tuple(n for n, _ in scans), tuple(size for _, size in scans)
+    return ScanFiles(folder, names, sizes, tuple(sorted(others)), like)
 
 
 def holds_scans(folder: Path, suffixes: tuple[str, ...]) -> bool:
     """Whether a folder has at least one file with one of the suffixes directly in it."""
-    if not folder.is_dir():
-        return False
-    with os.scandir(folder) as entries:
-        return any(_is_scan(entry, suffixes) for entry in entries)
+    return any(_is_scan(entry, suffixes) for entry in _entries(folder))
 
 
 def _is_scan(entry: "os.DirEntry[str]", suffixes: tuple[str, ...]) -> bool:
@@ -106,12 +113,33 @@ def _is_scan(entry: "os.DirEntry[str]", suffixes: tuple[str, ...]) -> bool:
 
 
 def subfolders(folder: Path) -> list[Path]:
-    """The folders directly below one, hidden ones left out, in natural order; none where it is absent."""
-    if not folder.is_dir():
-        return []
-    with os.scandir(folder) as entries:
-        found = [Path(e.path) for e in entries if e.is_dir() and not e.name.startswith(".")]
+    """The folders directly below one, in natural order; none where it is absent.
+
+    Hidden ones are left out, and those that we may not look into, such as lost+found.
+    """
+    shown = [Path(e.path) for e in _entries(folder) if e.is_dir() and not e.name.startswith(".")]
+    found = [path for path in shown if os.access(path, os.R_OK | os.X_OK)]
     return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder, as far as we may look: `Path.is_dir` raises PermissionError where we may not."""
+    return os.path.isdir(path)
+
+
+def _entries(folder: Path) -> list["os.DirEntry[str]"]:
+    """What a folder holds; nothing where it is absent or closed to us."""
+    try:
+        with os.scandir(folder) as entries:
+            return list(entries)
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return []
+
+
+def examples(items: Iterable[str]) -> str:
+    """The first few of a list, for a message."""
+    first = list(itertools.islice(items, _SHOWN + 1))
+    return ", ".join(first[:_SHOWN]) + (", ..." if len(first) > _SHOWN else "")
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, str]], str]:

@@ -160,7 +160,7 @@ class DataSet(ABC):
         deskew: bool,
         beam_correction_deg: float | int,
     ) -> None:
-        require_count("data.max_frames", max_frames)
+        require_count("data.max_frames", max_frames, optional=True)
         self.root = Path(root).expanduser()
         self.projection = projection
         self.train_sequences = sequence_names(train_sequences, self.digits)
@@ -203,7 +203,7 @@ class DataSet(ABC):
 
     @abstractmethod
     def check(self) -> LayoutReport:
-        """Describe this copy: found, missing, odd. Of each sequence the first scan is read at most."""
+        """Describe this copy: found, missing, odd. Of each sequence's scans a few are read at most."""
 
     def prepare(self, names: Iterable[str] | None = None) -> None:  # noqa: B027 - most data sets have nothing to do
         """Make what can be made on the spot (simulated scans); called once, before any sequence is opened.

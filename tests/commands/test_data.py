@@ -1,3 +1,4 @@
+import re
 import subprocess
 import sys
 
@@ -5,6 +6,7 @@ import pytest
 
 from lidarlearn.commands.data import compose_data_set, data_groups, main
 from lidarlearn.data.sequence import DataSet
+from lidarlearn.errors import UserError
 from tests.data.writers import (
     as_rows,
     random_points,
@@ -91,6 +93,33 @@ def test_a_whole_copy_is_usable_and_a_partial_one_is_described(tmp_path, capsys,
     assert f"({sequence})" in printed  # what there is instead
 
 
+@pytest.mark.parametrize(
+    ("name", "write", "sequence"),
+    [
+        ("kitti_00-08", write_kitti_odometry, "04"),
+        ("kitti_raw", write_kitti_raw, "2011_09_26_drive_0009"),
+        ("kitti_360", write_kitti_360, "0003"),
+        ("newer_college", write_newer_college, "01_short_experiment"),
+        ("nclt", write_nclt, "2012-01-08"),
+        ("ford_campus", write_ford_campus, "IJRR-Dataset-1"),
+    ],
+)
+def test_scans_with_other_names_are_shown(tmp_path, capsys, name, write, sequence):
+    write(tmp_path)
+    data = compose_data_set([f"data={name}", f"data.root={tmp_path}", *only(sequence)])
+    scans = data.found()[sequence]
+    for number in range(len(scans)):
+        scans.path(number).rename(scans.folder / f"my_{number}{scans.path(number).suffix}")
+    seen = f"({len(scans)} files there, none named like {scans.like}: 'my_0."
+    example = scans.folder / scans.like
+    code, printed = run(capsys, "check", f"data={name}", f"data.root={tmp_path}", *only(sequence))
+    assert code == 1 and seen in printed
+    with pytest.raises(UserError, match=re.escape(seen)):
+        data.sequence(sequence)
+    example.write_bytes(b"")
+    assert data.found()[sequence].names == (scans.like,)
+
+
 @pytest.mark.parametrize("name", data_groups())
 @pytest.mark.parametrize("count", ["0", "-1"])
 def test_no_data_set_takes_no_scans_for_a_number_of_scans(capsys, name, count):
@@ -98,9 +127,11 @@ def test_no_data_set_takes_no_scans_for_a_number_of_scans(capsys, name, count):
     assert code == 1 and f"data.max_frames={count}" in printed and "at least 1" in printed
 
 
-def test_a_simulated_drive_needs_a_scan(capsys):
-    code, printed = run(capsys, "check", "data=simulated_urban", "data.frames=0")
-    assert code == 1 and "data.frames" in printed and "at least 1" in printed
+@pytest.mark.parametrize("count", ["0", "null"])
+def test_a_simulated_drive_needs_a_scan(count):
+    command = [sys.executable, "-m", "lidarlearn.data", "check", "data=simulated_urban", f"data.frames={count}"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)  # here, hints of types are checked, too
+    assert done.returncode == 1 and f"error: data.frames={count}:" in done.stdout and "at least 1" in done.stdout
 
 
 @pytest.mark.parametrize("name", data_groups())

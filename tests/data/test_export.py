@@ -16,7 +16,7 @@ from lidarlearn.geometry import se3
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl32_inverted, hdl64
-from tests.data.writers import random_points, write_float32
+from tests.data.writers import curve, kitti_rows, random_points, write_float32
 from tests.odometry.odometries import build, motion_errors, poses
 
 FRAMES = 5
@@ -224,6 +224,24 @@ def test_the_car_goes_where_its_packets_say(tmp_path):
 def test_what_a_format_cannot_hold_is_said(name, distorted, said, tmp_path):
     with pytest.raises(UserError, match=said):
         export(simulated(hdl64(64), distorted, frames=2), target_of(name, tmp_path), "2012-01-08_drive_1")
+
+
+def test_nothing_is_written_where_one_of_the_drives_cannot_be(tmp_path, capsys):
+    write_folder(tmp_path / "scans")
+    (tmp_path / "scans" / "a" / "poses.txt").write_text(kitti_rows(curve(2)))  # but none for b
+    to = ("to=ford_campus", f"to.root={tmp_path}/ford", "to.train_sequences=[IJRR-Dataset-1,IJRR-Dataset-2]")
+    source = ("data=folder", f"data.root={tmp_path}/scans", "data.val_sequences=[]", "data.test_sequences=[]")
+    assert run(*source, *to) == 1
+    assert "b has no ground truth" in capsys.readouterr().out and not (tmp_path / "ford").exists()
+    (tmp_path / "scans" / "b" / "poses.txt").write_text(kitti_rows(curve(2)))
+    assert run(*source, *to) == 0
+
+
+@pytest.mark.parametrize(("name", "sequence", "said"), [("nclt", "day", "date"), ("kitti_raw", "day", "name a drive")])
+def test_names_that_a_format_cannot_hold(name, sequence, said, tmp_path):
+    with pytest.raises(UserError, match=said):
+        export(simulated(hdl64(64), name == "kitti_raw", frames=2), target_of(name, tmp_path), sequence)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

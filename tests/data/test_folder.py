@@ -121,6 +121,18 @@ def test_clocks_that_do_not_agree(tmp_path):
         folder(tmp_path).sequence("drive")
 
 
+def test_scans_that_the_ground_truth_does_not_cover_are_left_out(tmp_path, caplog):
+    write_scans(tmp_path / "drive")
+    (tmp_path / "drive" / "times.txt").write_text("1\n2\n3\n")
+    (tmp_path / "drive" / "poses.tum").write_text(
+        "# time tx ty tz in m, qx qy qz qw of it\n" + tum_rows(curve(2), [2, 2.5])
+    )
+    sequence = folder(tmp_path, max_frames=1).sequence("drive")
+    assert sequence.scans.names == ("2.bin",) and sequence.timestamps.tolist() == [2.0]
+    assert np.allclose(sequence.T_world_lidar, np.eye(4))
+    assert "drive: 2 scans before or after the ground truth are left out" in caplog.text
+
+
 def test_scans_of_several_kinds(tmp_path):
     write_scans(tmp_path / "drive")
     write_pcd(tmp_path / "drive" / "0.pcd", random_points(0), TIMES)

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 import torch
 
+from lidarlearn.data import kitti_raw
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.kitti_raw import ODOMETRY_DRIVES, KittiRaw, sweep_times
-from lidarlearn.data.oxts import mercator
+from lidarlearn.data.oxts import mercator, read_oxts_poses
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import grid_sample
@@ -136,6 +137,14 @@ def test_damaged_files(tmp_path, file, content, problem):
     (folder(tmp_path) / file).write_text(content)
     with pytest.raises(DamagedFileError, match=problem):
         raw(tmp_path).sequence(DRIVE)
+
+
+def test_a_check_reads_packets_around_the_first_scan_alone(tmp_path, monkeypatch):
+    write_kitti_raw(tmp_path, frames=40)
+    read = []
+    monkeypatch.setattr(kitti_raw, "read_oxts_poses", lambda packets: read.append(packets) or read_oxts_poses(packets))
+    assert raw(tmp_path).check().usable
+    assert [packets.numbers for packets in read] == [list(range(10))]  # within a second
 
 
 def test_a_truncated_scan(tmp_path):

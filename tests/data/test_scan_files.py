@@ -1,6 +1,9 @@
+import os
+
 import numpy as np
 import pytest
 
+from lidarlearn.commands.data import data_groups, main
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.scan_files import gaps, list_scans, natural_key, read_float32_rows, sequence_names
 from lidarlearn.errors import UserError
@@ -18,6 +21,30 @@ def test_scans_come_in_natural_order(tmp_path):
 
 def test_an_absent_folder_holds_no_scans(tmp_path):
     assert len(list_scans(tmp_path / "nowhere", (".bin",))) == 0
+
+
+@pytest.mark.parametrize("name", [name for name in data_groups() if not name.startswith("simulated")])
+def test_a_folder_that_is_closed_to_us_holds_nothing(name, tmp_path, monkeypatch, capsys):
+    """As lost+found is on every disk; a superuser, as whom tests may run, is stopped by no permission."""
+    (tmp_path / "lost+found").mkdir()
+
+    def closed(look):
+        def looks(path, **options):
+            if "lost+found" in str(path):
+                raise PermissionError(13, "Permission denied", str(path))
+            return look(path, **options)
+
+        return looks
+
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: "lost+found" not in str(path) and access(path, mode))
+    monkeypatch.setattr(os, "scandir", closed(os.scandir))
+    monkeypatch.setattr(os, "stat", closed(os.stat))
+    for root in (tmp_path, tmp_path / "lost+found", tmp_path / "lost+found" / "closed"):
+        with pytest.raises(SystemExit) as exited:
+            main(["check", f"data={name}", f"data.root='{root}'"])
+        assert exited.value.code == 1 and "NOT usable" in capsys.readouterr().out
+    assert not len(list_scans(tmp_path / "lost+found", (".bin",)))
 
 
 def test_natural_key_orders_by_value_then_by_text():

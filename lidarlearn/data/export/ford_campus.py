@@ -11,9 +11,14 @@ from lidarlearn.data.ford_campus import FordCampus
 from lidarlearn.data.sequence import Sequence
 
 
+def require_ford_campus(drive: Sequence, target: FordCampus, name: str) -> None:
+    """Raise UserError unless the scans are compensated and have poses."""
+    require_compensated(drive, target.title)
+    ground_truth_of(drive, target.title)
+
+
 def write_ford_campus(drive: Sequence, target: FordCampus, name: str) -> None:
     """MATLAB files with points, pose and time. Points closer than `min_range_m` are written, but not read back."""
-    require_compensated(drive, target.title)
     T_world_vehicle = ground_truth_of(drive, target.title) @ torch.linalg.inv(target.T_vehicle_lidar)
     folder = target.root / name / "SCANS"
     folder.mkdir(parents=True, exist_ok=True)

@@ -8,12 +8,12 @@ from typing import Any
 
 from lidarlearn.data.cloud_files import SUFFIXES
 from lidarlearn.data.export.folder import write_folder
-from lidarlearn.data.export.ford_campus import write_ford_campus
-from lidarlearn.data.export.kitti import write_kitti_odometry
-from lidarlearn.data.export.kitti_360 import write_kitti_360
-from lidarlearn.data.export.kitti_raw import write_kitti_raw
-from lidarlearn.data.export.nclt import write_nclt
-from lidarlearn.data.export.newer_college import write_newer_college
+from lidarlearn.data.export.ford_campus import require_ford_campus, write_ford_campus
+from lidarlearn.data.export.kitti import require_kitti_odometry, write_kitti_odometry
+from lidarlearn.data.export.kitti_360 import require_kitti_360, write_kitti_360
+from lidarlearn.data.export.kitti_raw import require_kitti_raw, write_kitti_raw
+from lidarlearn.data.export.nclt import require_nclt, write_nclt
+from lidarlearn.data.export.newer_college import require_newer_college, write_newer_college
 from lidarlearn.data.folder import Folder
 from lidarlearn.data.ford_campus import FordCampus
 from lidarlearn.data.kitti import KittiOdometry
@@ -34,23 +34,31 @@ class Format:
 
     Args:
         option: a choice of `to=` on the command line that is written so.
+        require: raises UserError where the format cannot hold a drive; takes what `write` does.
         write: takes a drive, the target and the sequence's name there.
         places: below the root, what belongs to a sequence alone; `{}` stands for its name, `*` for anything.
     """
 
     option: str
+    require: Callable[[Sequence, Any, str], None]
     write: Callable[[Sequence, Any, str], None]
     places: tuple[str, ...] = ("{}",)
 
 
+def _anything(drive: Sequence, target: Any, name: str) -> None:
+    """A folder of scans holds every drive."""
+
+
 _FORMATS: dict[type[DataSet], Format] = {
-    KittiOdometry: Format("kitti_00-08", write_kitti_odometry, ("sequences/{}", "poses/{}.txt")),
-    KittiRaw: Format("kitti_raw", write_kitti_raw, ("*/{}_sync",)),
-    Kitti360: Format("kitti_360", write_kitti_360, ("data_*/*_drive_{}_sync",)),
-    FordCampus: Format("ford_campus", write_ford_campus),
-    Nclt: Format("nclt", write_nclt, ("{}", "ground_truth/groundtruth_{}.csv")),
-    NewerCollege: Format("newer_college", write_newer_college),
-    Folder: Format("folder", write_folder, ("{}", "{}.txt", "{}.tum")),
+    KittiOdometry: Format(
+        "kitti_00-08", require_kitti_odometry, write_kitti_odometry, ("sequences/{}", "poses/{}.txt")
+    ),
+    KittiRaw: Format("kitti_raw", require_kitti_raw, write_kitti_raw, ("*/{}_sync",)),
+    Kitti360: Format("kitti_360", require_kitti_360, write_kitti_360, ("data_*/*_drive_{}_sync",)),
+    FordCampus: Format("ford_campus", require_ford_campus, write_ford_campus),
+    Nclt: Format("nclt", require_nclt, write_nclt, ("{}", "ground_truth/groundtruth_{}.csv")),
+    NewerCollege: Format("newer_college", require_newer_college, write_newer_college),
+    Folder: Format("folder", _anything, write_folder, ("{}", "{}.txt", "{}.tum")),
 }
 
 
@@ -69,7 +77,9 @@ def export(drive: Sequence, target: DataSet, name: str, suffix: str | None = Non
     Raises:
         UserError: the format cannot hold such a drive, or there is such a sequence already.
     """
-    write = format_of(target, suffix).write
+    form = format_of(target, suffix)
+    form.require(drive, target, name)
+    write = form.write
     require_new(target, name)
     writable(target.root, _REMEDY)
     if suffix is not None:

@@ -18,9 +18,13 @@ _T_CAMERA_LIDAR = torch.tensor(
 )
 
 
+def require_kitti_odometry(drive: Sequence, target: KittiOdometry, name: str) -> None:
+    """Raise UserError unless the scans are compensated."""
+    require_compensated(drive, target.title)
+
+
 def write_kitti_odometry(drive: Sequence, target: KittiOdometry, name: str) -> None:
     """Scans, calib.txt, times.txt and, where the drive has ground truth, poses."""
-    require_compensated(drive, target.title)
     folder = target.root / "sequences" / name
     (folder / "velodyne").mkdir(parents=True, exist_ok=True)
     for index, scan in enumerate(scans_of(drive, name)):

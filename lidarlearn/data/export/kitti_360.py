@@ -18,9 +18,14 @@ _T_LIDAR_CAMERA = torch.tensor(
 )
 
 
+def require_kitti_360(drive: Sequence, target: Kitti360, name: str) -> None:
+    """Raise UserError unless azimuths tell the points' times, and there are poses."""
+    require_sweeps(drive, target.title)
+    ground_truth_of(drive, target.title)
+
+
 def write_kitti_360(drive: Sequence, target: Kitti360, name: str) -> None:
     """Scans, their times, a pose for each, and the calibrations from LiDAR over camera to GPS/IMU."""
-    require_sweeps(drive, target.title)
     T_world_lidar = ground_truth_of(drive, target.title)
     velodyne = target.root / "data_3d_raw" / drive_folder(name) / "velodyne_points"
     poses, calibration = target.root / "data_poses" / drive_folder(name), target.root / "calibration"

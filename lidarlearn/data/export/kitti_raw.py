@@ -28,16 +28,21 @@ _START_DEG = (49.0, 8.4)  # latitude and longitude of Karlsruhe
 _START_ALTITUDE_M = 115.0
 
 
+def require_kitti_raw(drive: Sequence, target: KittiRaw, name: str) -> None:
+    """Raise UserError unless azimuths tell the points' times, there are poses, and the name is a drive's."""
+    require_sweeps(drive, target.title)
+    ground_truth_of(drive, target.title)
+    if not name.partition("_drive_")[2]:
+        raise UserError(f"{target.title}: {name!r} does not name a drive.\n  change: a name like 2011_09_26_drive_0009")
+
+
 def write_kitti_raw(drive: Sequence, target: KittiRaw, name: str) -> None:
     """Scans, start and end times, GPS/IMU packets at the middle of each sweep, and the calibration between the two.
 
     Of a packet, position, orientation and velocity are filled in; accelerations, rates and accuracies are zero.
     """
-    require_sweeps(drive, target.title)
     T_world_lidar = ground_truth_of(drive, target.title)
-    date, _, number = name.partition("_drive_")
-    if not number:
-        raise UserError(f"{target.title}: {name!r} does not name a drive.\n  change: a name like 2011_09_26_drive_0009")
+    date = name.partition("_drive_")[0]
     folder = target.root / date / f"{name.removesuffix('_sync')}_sync"
     T_lidar_imu = torch.eye(4, dtype=torch.float64)
     T_lidar_imu[:3, 3] = torch.tensor(_LEVER_ARM_M)

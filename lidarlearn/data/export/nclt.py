@@ -16,18 +16,19 @@ _LASERS = 32
 _LOWEST_DEG, _HIGHEST_DEG = -10.67, 30.67  # of the HDL-32 upside down
 
 
+def require_nclt(drive: Sequence, target: Nclt, name: str) -> None:
+    """Raise UserError unless the scans are compensated, and the name is a date."""
+    require_compensated(drive, target.title)
+    _noon(name)
+
+
 def write_nclt(drive: Sequence, target: Nclt, name: str) -> None:
     """Scans in steps of 5 mm and, where the drive has ground truth, a row of it at the time of each scan.
 
     The laser of a point is told from its elevation. Points that the format cannot hold, farther than 100 m behind or
     to the right, are left out.
     """
-    require_compensated(drive, target.title)
-    try:
-        day = datetime.strptime(name, "%Y-%m-%d").replace(hour=12, tzinfo=timezone.utc)
-    except ValueError as error:
-        raise UserError(f"NCLT: {name!r} is not a date.\n  change: a name like 2012-01-08") from error
-    utimes = int(day.timestamp()) * 1_000_000 + torch.round(timestamps_of(drive) * 1e6).long()
+    utimes = int(_noon(name).timestamp()) * 1_000_000 + torch.round(timestamps_of(drive) * 1e6).long()
     folder = target.root / name
     (folder / "velodyne_sync").mkdir(parents=True, exist_ok=True)
     for utime, scan in zip(utimes.tolist(), scans_of(drive, name), strict=True):
@@ -53,3 +54,11 @@ def write_nclt(drive: Sequence, target: Nclt, name: str) -> None:
             f"{t}, " + ", ".join(f"{v:.12g}" for v in row) for t, row in zip(utimes.tolist(), numbers, strict=True)
         )
         (folder / f"groundtruth_{name}.csv").write_text("\n".join(rows_text) + "\n")
+
+
+def _noon(name: str) -> datetime:
+    """Of the day that a sequence is named after."""
+    try:
+        return datetime.strptime(name, "%Y-%m-%d").replace(hour=12, tzinfo=timezone.utc)
+    except ValueError as error:
+        raise UserError(f"NCLT: {name!r} is not a date.\n  change: a name like 2012-01-08") from error

@@ -15,12 +15,17 @@ from lidarlearn.errors import UserError
 _START_S = 1_583_836_591  # of the first walk
 
 
+def require_newer_college(drive: Sequence, target: NewerCollege, name: str) -> None:
+    """Raise UserError unless points have times, and scans poses."""
+    _columns(drive, drive.scan(0))
+    ground_truth_of(drive, target.title)
+
+
 def write_newer_college(drive: Sequence, target: NewerCollege, name: str) -> None:
     """Scans of 1024 columns of 64 points, the times of their first columns in their names, and the camera's poses.
 
     Within a column a point takes any free row: where two columns of the drive fall into one, the surplus is left out.
     """
-    _columns(drive, drive.scan(0))
     T_world_camera = (ground_truth_of(drive, target.title) @ torch.linalg.inv(T_CAMERA_LIDAR)).numpy()
     middles = np.round(timestamps_of(drive).numpy() * 1e9).astype(np.int64) + _START_S * 10**9
     folder = target.root / name
