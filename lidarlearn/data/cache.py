@@ -150,7 +150,8 @@ def _build(
             {"sequence": sequence.name, "fingerprint": sequence.fingerprint, "code": _code(sequence)}
             | asdict(projection),
             indent=2,
-        )
+        ),
+        encoding="utf-8",
     )
     missing = np.flatnonzero(~done).tolist()
     scans = DataLoader(

@@ -33,7 +33,7 @@ def read_lines(path: Path) -> list[str]:
         DamagedFileError: absent, or no text.
     """
     try:
-        return path.read_text().splitlines()
+        return path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DamagedFileError(path, f"cannot be read: {error}") from error
 

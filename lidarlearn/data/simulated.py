@@ -218,7 +218,7 @@ class SimulatedDataSet(DataSet):
         folder.mkdir(parents=True, exist_ok=True)
         settings = {"world": drive.world_name, "seed": drive.seed, "frames": len(drive), "sensor": drive.sensor.name}
         settings |= {"columns": drive.sensor.columns, "static": self.static, "speed": self.speed}
-        (folder / "settings.json").write_text(json.dumps(settings, indent=2))
+        (folder / "settings.json").write_text(json.dumps(settings, indent=2), encoding="utf-8")
 
 
 def image_path(folder: Path, index: int) -> Path:

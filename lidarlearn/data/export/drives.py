@@ -28,7 +28,7 @@ def write_shared(path: Path, text: str) -> None:
             "  change: to.root=/an/empty/folder"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
 
 
 def scans_of(drive: Sequence, name: str) -> Iterator[Scan]:

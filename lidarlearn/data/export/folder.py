@@ -36,9 +36,11 @@ def write_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd
         if scan.times is not None:
             fields["t"] = ((scan.times - scan.times.min()) * PERIOD_S).numpy()
         _write(folder / f"{index:06d}{suffix}", fields, target.bin_columns)
-    (folder / "times.txt").write_text("".join(f"{time:.9f}\n" for time in timestamps_of(drive).tolist()))
+    (folder / "times.txt").write_text(
+        "".join(f"{time:.9f}\n" for time in timestamps_of(drive).tolist()), encoding="utf-8"
+    )
     if drive.T_world_lidar is not None:
-        (folder / "poses.txt").write_text("".join(f"{matrix_row(T)}\n" for T in drive.T_world_lidar))
+        (folder / "poses.txt").write_text("".join(f"{matrix_row(T)}\n" for T in drive.T_world_lidar), encoding="utf-8")
 
 
 def _write(path: Path, fields: dict[str, NDArray[np.float32]], bin_columns: int) -> None:

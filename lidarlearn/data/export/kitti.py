@@ -32,13 +32,15 @@ def write_kitti_odometry(drive: Sequence, target: KittiOdometry, name: str) -> N
     T_camera_lidar = drive.T_reference_lidar if drive.reference_frame == "camera" else _T_CAMERA_LIDAR
     pinhole = matrix_row(torch.eye(4, dtype=torch.float64))
     calibration = [*(f"P{camera}: {pinhole}" for camera in range(4)), f"Tr: {matrix_row(T_camera_lidar)}"]
-    (folder / "calib.txt").write_text("\n".join(calibration) + "\n")
-    (folder / "times.txt").write_text("".join(f"{time:.9e}\n" for time in timestamps_of(drive).tolist()))
+    (folder / "calib.txt").write_text("\n".join(calibration) + "\n", encoding="utf-8")
+    (folder / "times.txt").write_text(
+        "".join(f"{time:.9e}\n" for time in timestamps_of(drive).tolist()), encoding="utf-8"
+    )
     if drive.T_world_lidar is not None:
         T_world_camera = T_camera_lidar @ drive.T_world_lidar @ torch.linalg.inv(T_camera_lidar)
         (target.root / "poses").mkdir(exist_ok=True)
         rows = "".join(f"{matrix_row(T)}\n" for T in T_world_camera)
-        (target.root / "poses" / f"{name}.txt").write_text(rows)
+        (target.root / "poses" / f"{name}.txt").write_text(rows, encoding="utf-8")
 
 
 def write_velodyne_points(path: Path, scan: Scan, beam_correction_deg: float) -> None:

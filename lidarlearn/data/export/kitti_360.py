@@ -38,4 +38,4 @@ def write_kitti_360(drive: Sequence, target: Kitti360, name: str) -> None:
     write_timestamps(velodyne / "timestamps.txt", _DAY, timestamps_of(drive))
     T_world_imu = T_world_lidar @ _T_LIDAR_CAMERA @ torch.linalg.inv(_T_IMU_CAMERA)
     rows = (f"{index} {matrix_row(T)}\n" for index, T in enumerate(T_world_imu))
-    (poses / "poses.txt").write_text("".join(rows))
+    (poses / "poses.txt").write_text("".join(rows), encoding="utf-8")

@@ -62,7 +62,7 @@ def write_kitti_raw(drive: Sequence, target: KittiRaw, name: str) -> None:
     packets = _packets((T_world_lidar @ T_lidar_imu).numpy(), middles.numpy())
     for index, row in enumerate(packets):
         text = " ".join(f"{value:.14g}" for value in row)
-        (folder / "oxts" / "data" / f"{index:010d}.txt").write_text(text + "\n")
+        (folder / "oxts" / "data" / f"{index:010d}.txt").write_text(text + "\n", encoding="utf-8")
 
 
 def write_timestamps(path: Path, day: np.datetime64, seconds: Float[Tensor, "n"]) -> None:
@@ -74,7 +74,7 @@ def write_timestamps(path: Path, day: np.datetime64, seconds: Float[Tensor, "n"]
         seconds: of each line.
     """
     stamps = day + np.timedelta64(12, "h") + np.round(seconds.numpy() * 1e9).astype("timedelta64[ns]")
-    path.write_text("".join(f"{str(stamp).replace('T', ' ')}\n" for stamp in stamps))
+    path.write_text("".join(f"{str(stamp).replace('T', ' ')}\n" for stamp in stamps), encoding="utf-8")
 
 
 def _packets(T_world_imu: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:

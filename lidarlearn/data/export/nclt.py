@@ -53,7 +53,7 @@ def write_nclt(drive: Sequence, target: Nclt, name: str) -> None:
         rows_text = (
             f"{t}, " + ", ".join(f"{v:.12g}" for v in row) for t, row in zip(utimes.tolist(), numbers, strict=True)
         )
-        (folder / f"groundtruth_{name}.csv").write_text("\n".join(rows_text) + "\n")
+        (folder / f"groundtruth_{name}.csv").write_text("\n".join(rows_text) + "\n", encoding="utf-8")
 
 
 def _noon(name: str) -> datetime:

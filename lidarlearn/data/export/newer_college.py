@@ -47,7 +47,7 @@ def write_newer_college(drive: Sequence, target: NewerCollege, name: str) -> Non
     lines = ["#sec,nsec,x,y,z,qx,qy,qz,qw"]
     for middle, row in zip(middles.tolist(), np.concatenate([T_world_camera[:, :3, 3], quaternions], 1), strict=True):
         lines.append(",".join([*map(str, divmod(middle, 10**9)), *(f"{value:.12g}" for value in row)]))
-    (folder / "ground_truth" / "registered_poses.csv").write_text("\n".join(lines) + "\n")
+    (folder / "ground_truth" / "registered_poses.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _columns(drive: Sequence, scan: Scan) -> NDArray[np.int64]:
