@@ -134,10 +134,10 @@ class Odometry(ScanByScan):
     def _try_others(
         self, scan: SampledScan, T_guess: Tensor, result: RegistrationResult, health: Health
     ) -> tuple[RegistrationResult, Health]:
-        """The better of a doubtful registration and the best from other motions; a leap must be clearly better."""
+        """The better of a doubtful registration and the best from other motions; one that leaps, clearly the better."""
         other = self._register(scan, self._search(scan, surprise_motions(T_guess, self._motion)), "recovery")
         other_health = self._assess(scan, other, "recovery")
-        needed = self._judgement.min_gain if other_health.implausible else 0.0
+        needed = self._judgement.min_gain * (other_health.implausible - health.implausible)
         if self._agreement(scan, other) - self._agreement(scan, result) > needed:
             result, health = other, other_health
         return result, replace(health, status="recovered")
