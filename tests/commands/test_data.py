@@ -31,6 +31,16 @@ SPLITS = {
 }
 CLOUD = as_rows(random_points(0), [(axis, "<f4") for axis in "xyz"])
 
+# data sets whose files have names of their own, a writer of each, and a sequence that it writes
+PUBLISHED = (
+    ("kitti_00-08", write_kitti_odometry, "04"),
+    ("kitti_raw", write_kitti_raw, "2011_09_26_drive_0009"),
+    ("kitti_360", write_kitti_360, "0003"),
+    ("newer_college", write_newer_college, "01_short_experiment"),
+    ("nclt", write_nclt, "2012-01-08"),
+    ("ford_campus", write_ford_campus, "IJRR-Dataset-1"),
+)
+
 
 def only(name):
     return [f"data.{split}_sequences=[{name}]" for split in ("train", "val", "test")]
@@ -74,12 +84,7 @@ def test_sequence_numbers_from_the_command_line():
 @pytest.mark.parametrize(
     ("name", "write", "sequence"),
     [
-        ("kitti_00-08", write_kitti_odometry, "04"),
-        ("kitti_raw", write_kitti_raw, "2011_09_26_drive_0009"),
-        ("kitti_360", write_kitti_360, "0003"),
-        ("newer_college", write_newer_college, "01_short_experiment"),
-        ("nclt", write_nclt, "2012-01-08"),
-        ("ford_campus", write_ford_campus, "IJRR-Dataset-1"),
+        *PUBLISHED,
         ("folder", lambda root: write_float32(root / "drive" / "0.bin", [[1, 2, 3]]), "drive"),
         ("rosbag", lambda root: write_bag(root, "drive", {"/points": [CLOUD]}), "drive"),
     ],
@@ -93,17 +98,7 @@ def test_a_whole_copy_is_usable_and_a_partial_one_is_described(tmp_path, capsys,
     assert f"({sequence})" in printed  # what there is instead
 
 
-@pytest.mark.parametrize(
-    ("name", "write", "sequence"),
-    [
-        ("kitti_00-08", write_kitti_odometry, "04"),
-        ("kitti_raw", write_kitti_raw, "2011_09_26_drive_0009"),
-        ("kitti_360", write_kitti_360, "0003"),
-        ("newer_college", write_newer_college, "01_short_experiment"),
-        ("nclt", write_nclt, "2012-01-08"),
-        ("ford_campus", write_ford_campus, "IJRR-Dataset-1"),
-    ],
-)
+@pytest.mark.parametrize(("name", "write", "sequence"), PUBLISHED)
 def test_scans_with_other_names_are_shown(tmp_path, capsys, name, write, sequence):
     write(tmp_path)
     data = compose_data_set([f"data={name}", f"data.root={tmp_path}", *only(sequence)])
