@@ -57,6 +57,7 @@ def _measure(options: report.Options, folder: str, frames: int, height: int, wid
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     datamodule.prepare_data()
     datamodule.setup()
+    datamodule.keep_maps_on(options.device)
     module = build_module(config, datamodule, "benchmark").to(options.device).train()
     optimizer = module.configure_optimizers()["optimizer"]  # type: ignore[index, call-overload]
 
@@ -69,7 +70,7 @@ def _measure(options: report.Options, folder: str, frames: int, height: int, wid
 
     def to_device(batch: Pair) -> Pair:
         moved = {key: value.to(options.device, non_blocking=True) for key, value in batch.items()}  # type: ignore[attr-defined]
-        return datamodule.on_after_batch_transfer(moved, 0)
+        return datamodule.completed(moved, augmented=True)
 
     def step(batch: Pair, bare: bool = False) -> None:
         optimizer.zero_grad()

@@ -2,12 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarlearn.data.cache import to_16_bits
 from lidarlearn.data.pairs import Pair
 from lidarlearn.geometry import se3
 
@@ -22,7 +22,7 @@ class Augmentation:
             that drives forward drives sideways. For platforms that move in any direction.
         reverse: half of the pairs swap their scans: a car that drives forward drives backward.
         max_skip: the second scan of a pair is up to so many scans after the first; 1 for neighbours alone. Steps of
-            two or three show a network trained in town the speeds of a motorway.
+            two or three show a network trained in town the speeds of a motorway. See `ScanPairs`.
         drop_out: up to this share of the pixels of each image is emptied.
     """
 
@@ -36,22 +36,24 @@ class Augmentation:
         if self.max_skip < 1 or not 0 <= self.drop_out < 1:
             raise ValueError(f"an augmentation needs max_skip >= 1 and 0 <= drop_out < 1, got {self}")
 
-    def step(self) -> int:
-        """How many scans lie between the two of a pair, from 1 to `max_skip`."""
-        return 1 if self.max_skip == 1 else int(torch.randint(1, self.max_skip + 1, ()))
+    def __call__(self, batch: Pair) -> Pair:
+        """The batch with each pair changed by a chance of its own, on whatever device it is.
 
-    def __call__(self, pair: Pair) -> Pair:
-        """The pair, changed by chance."""
-        if self.mirror and torch.rand(()) < 0.5:
-            pair = mirrored(pair)
-        if self.reverse and torch.rand(()) < 0.5:
-            pair = reversed_in_time(pair)
+        All chance comes out of the CPU's stream of random numbers, which a checkpoint keeps.
+        """
+        (pairs, _, height, width), device = batch["reference"].shape, batch["reference"].device
+        if self.mirror:
+            batch = _where(_half_of(pairs, device), mirrored(batch), batch)
+        if self.reverse:
+            batch = _where(_half_of(pairs, device), reversed_in_time(batch), batch)
         if self.turn:
-            pair = turned(pair, columns=int(torch.randint(pair["reference"].shape[-1], ())))
+            batch = turned(batch, torch.randint(width, (pairs,)).to(device, non_blocking=True))
         if self.drop_out > 0:
-            keep = [torch.rand(pair["reference"].shape[1:]) >= self.drop_out * torch.rand(()) for _ in range(2)]
-            pair = thinned(pair, *keep)
-        return pair
+            generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, ())))
+            chances = torch.rand(2, pairs, height, width, generator=generator, device=device)
+            shares = self.drop_out * torch.rand(2, pairs, 1, 1, generator=generator, device=device)
+            batch = thinned(batch, *(chances >= shares))
+        return batch
 
 
 def mirrored(pair: Pair) -> Pair:
@@ -59,26 +61,27 @@ def mirrored(pair: Pair) -> Pair:
 
     Azimuth a becomes -a, and with it column c becomes width - 1 - c.
     """
-    flip = torch.tensor([1, -1, 1])[:, None, None]
+    flip = torch.eye(4, dtype=torch.float64, device=pair["reference"].device)
+    flip[1, 1] = -1
 
-    def mirror(vertex_map: Shaped[Tensor, "3 h w"]) -> Shaped[Tensor, "3 h w"]:
-        return (vertex_map * flip.to(vertex_map.dtype)).flip(-1)
+    def mirror(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
+        image = vertex_map.flip(-1)
+        image[..., 1, :, :].neg_()
+        return image
 
-    M = torch.diag(torch.tensor([1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
-    return _seen_by(pair, mirror(pair["reference"]), mirror(pair["target"]), M)
+    return _seen_by(pair, mirror(pair["reference"]), mirror(pair["target"]), flip)
 
 
-def turned(pair: Pair, columns: int) -> Pair:
-    """The pair as a sensor sees it that is turned, counter-clockwise, by the angle of so many columns.
+def turned(pair: Pair, columns: Int[Tensor, "*batch"]) -> Pair:
+    """The pair as a sensor sees it that is turned, counter-clockwise, by the angle of so many columns."""
+    width = pair["reference"].shape[-1]
+    angles = columns.double() * (-2 * math.pi / width)
+    M = se3.from_euler(torch.nn.functional.pad(angles[..., None], (5, 0)))
+    before = (torch.arange(width, device=columns.device) - columns[..., None]) % width
 
-    Points that 16 bits cannot hold any more, beyond 131 m along an axis, become empty pixels.
-    """
-    angle = 2 * math.pi * columns / pair["reference"].shape[-1]
-    M = se3.from_euler(torch.tensor([0, 0, 0, 0, 0, -angle], dtype=torch.float64))
-
-    def turn(vertex_map: Shaped[Tensor, "3 h w"]) -> Shaped[Tensor, "3 h w"]:
-        points = torch.einsum("ij,jhw->ihw", M[:3, :3].float(), vertex_map.float()).roll(columns, dims=-1)
-        return points if vertex_map.is_floating_point() else to_16_bits(points)
+    def turn(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
+        points = torch.einsum("...ij,...jhw->...ihw", M[..., :3, :3].to(vertex_map), vertex_map)
+        return points.gather(-1, before[..., None, None, :].expand(points.shape))
 
     return _seen_by(pair, turn(pair["reference"]), turn(pair["target"]), M)
 
@@ -91,19 +94,34 @@ def reversed_in_time(pair: Pair) -> Pair:
     return swapped
 
 
-def thinned(pair: Pair, keep_reference: Bool[Tensor, "h w"], keep_target: Bool[Tensor, "h w"]) -> Pair:
+def thinned(pair: Pair, keep_reference: Bool[Tensor, "*batch h w"], keep_target: Bool[Tensor, "*batch h w"]) -> Pair:
     """The pair with all other pixels emptied."""
-    return {**pair, "reference": pair["reference"] * keep_reference, "target": pair["target"] * keep_target}
+    reference, target = keep_reference.unsqueeze(-3), keep_target.unsqueeze(-3)
+    return {**pair, "reference": pair["reference"] * reference, "target": pair["target"] * target}
 
 
 def _seen_by(
     pair: Pair,
-    reference: Shaped[Tensor, "3 h w"],
-    target: Shaped[Tensor, "3 h w"],
-    M: Float[Tensor, "4 4"],
+    reference: Float[Tensor, "*batch 3 h w"],
+    target: Float[Tensor, "*batch 3 h w"],
+    M: Float[Tensor, "*#batch 4 4"],
 ) -> Pair:
-    """Other images of the pair's scans: points p have become M p."""
+    """Other images of the pair's scans: points p have become M p, with an orthogonal M."""
     image = Pair(reference=reference, target=target, index=pair["index"])
     if "T_ref_new" in pair:
-        image["T_ref_new"] = M @ pair["T_ref_new"] @ torch.linalg.inv(M)
+        M = M.to(pair["T_ref_new"])
+        image["T_ref_new"] = M @ pair["T_ref_new"] @ se3.inverse(M)
     return image
+
+
+def _half_of(pairs: int, device: torch.device) -> Bool[Tensor, "batch"]:
+    return (torch.rand(pairs) < 0.5).to(device, non_blocking=True)
+
+
+def _where(chosen: Bool[Tensor, "batch"], changed: Pair, batch: Pair) -> Pair:
+    """The chosen pairs as changed, the others as they are."""
+
+    def choose(new: Tensor, old: Tensor) -> Tensor:
+        return torch.where(chosen.reshape(-1, *[1] * (old.dim() - 1)), new, old)
+
+    return cast(Pair, {key: choose(changed[key], batch[key]) for key in batch})  # type: ignore[literal-required]

@@ -4,18 +4,20 @@ import hashlib
 import json
 import shutil
 import sys
+from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from itertools import accumulate
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
 from filelock import FileLock, Timeout
-from jaxtyping import Float, Int16
+from jaxtyping import Float, Int, Int16
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, default_collate
 
 from lidarlearn.data.progress import tracked
 from lidarlearn.data.sequence import Sequence
@@ -34,41 +36,57 @@ _REMEDY = "datamodule.cache_root=/path/with/room, or the environment variable LI
 
 
 class VertexMaps:
-    """The vertex maps of a sequence, mapped from a file: costs no memory and travels to workers as a path.
+    """The vertex maps of sequences, one after another, mapped from files: no memory, and only paths travel to workers.
 
     Args:
-        file: the .npy file of shape (n, 3, h, w), int16.
+        files: the .npy file of each sequence, of shape (n, 3, h, w), int16.
     """
 
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self._maps = np.load(file, mmap_mode="r")
+    def __init__(self, *files: Path) -> None:
+        self.files = files
+        # "c": as if to be written to, in memory alone, without which torch warns; nothing is written
+        self._maps = [np.load(file, mmap_mode="c") for file in files]
+        self._ends = list(accumulate(map(len, self._maps)))
 
     def __len__(self) -> int:
-        return len(self._maps)
+        return self._ends[-1] if self._ends else 0
 
-    def __getitem__(self, index: int) -> Int16[Tensor, "3 h w"]:
-        return torch.from_numpy(np.array(self._maps[index]))
+    def __getitem__(self, rows: Int[Tensor, "*batch"] | int) -> Int16[Tensor, "*batch 3 h w"]:
+        rows = torch.as_tensor(rows)
+        # torch's collation stacks them, in a worker directly in the memory that it shares: each map is copied once
+        maps = default_collate([self._one(row) for row in rows.flatten().tolist()])
+        return maps.reshape(*rows.shape, *maps.shape[1:])
 
-    def __reduce__(self) -> tuple[type["VertexMaps"], tuple[Path]]:
-        return VertexMaps, (self.file,)
+    def __reduce__(self) -> tuple[type["VertexMaps"], tuple[Path, ...]]:
+        return VertexMaps, self.files
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that all of them take."""
+        return sum(maps.nbytes for maps in self._maps)
+
+    def to(self, device: torch.device) -> Int16[Tensor, "n 3 h w"]:
+        """All of them, in the memory of a device."""
+        resident = torch.empty(len(self), *self._maps[0].shape[1:], dtype=torch.int16, device=device)
+        for row in tracked(range(len(self)), f"vertex maps to {device}", len(self)):
+            resident[row] = self._one(row)
+        return resident
+
+    def _one(self, row: int) -> Int16[Tensor, "3 h w"]:
+        sequence = bisect_right(self._ends, row)
+        return torch.from_numpy(self._maps[sequence][row - self._ends[sequence]])  # counted from its end
 
 
 def encode(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Int16[Tensor, "*batch 3 h w"]:
     """Metres to multiples of `QUANTUM_M`; points beyond the range of 16 bits become empty pixels."""
-    return to_16_bits(vertex_map / QUANTUM_M)
-
-
-def to_16_bits(multiples: Float[Tensor, "*batch 3 h w"]) -> Int16[Tensor, "*batch 3 h w"]:
-    """Rounded; a pixel of which a coordinate goes beyond the range becomes empty."""
-    multiples = multiples.round()
+    multiples = (vertex_map / QUANTUM_M).round()
     inside = (multiples.abs() <= torch.iinfo(torch.int16).max).all(dim=-3, keepdim=True)
     return torch.where(inside, multiples, 0).to(torch.int16)
 
 
 def decode(multiples: Int16[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
     """Multiples of `QUANTUM_M` to metres, float32; empty pixels stay exact zeros."""
-    return multiples.to(torch.float32) * QUANTUM_M
+    return multiples * QUANTUM_M  # of integers and a float torch makes float32, in one pass
 
 
 def cached_vertex_maps(

@@ -1,28 +1,33 @@
 """The pairs of a data set's sequences as Lightning wants them."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import partial
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
 
 import torch
+from jaxtyping import Int16
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
-from torch.utils.data import ConcatDataset, DataLoader
+from torch.utils.data import DataLoader, default_convert
 
 from lidarlearn.data import cache
 from lidarlearn.data.augmentation import Augmentation
-from lidarlearn.data.pairs import Pair, ScanPairs
+from lidarlearn.data.pairs import Pair, ScanPairs, with_maps
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
+
+_RESIDENT_SHARE = 0.5  # of the free memory: the rest is the network's and its batches'
 
 
 class OdometryDataModule(LightningDataModule):
     """Training pairs shuffled over all training sequences; each validation sequence on its own, in order.
 
-    Batches reach the device as 16-bit integers and are decoded there.
+    Batches reach the device as 16-bit integers, or as row numbers of the vertex maps that are there for good; they are
+    decoded there, and changed by chance.
 
     Args:
         data: the data set.
@@ -31,6 +36,8 @@ class OdometryDataModule(LightningDataModule):
         cache_root: folder of the vertex maps' caches.
         height: rows of the network's image [px]; None takes the data set's.
         width: its columns [px]; None takes the data set's.
+        resident: whether all vertex maps, 6 bytes a pixel, are kept in the memory of the device; "auto" does so on a
+            GPU where they take less than half of what is free.
         augmentation: what is done to training pairs by chance; None for nothing.
         preparation_workers: processes that project scans into the cache; None takes one per core.
     """
@@ -43,20 +50,25 @@ class OdometryDataModule(LightningDataModule):
         cache_root: str = "datasets/cache",
         height: int | None = None,
         width: int | None = None,
+        resident: bool | str = "auto",
         augmentation: Augmentation | None = None,
         preparation_workers: int | None = None,
     ) -> None:
         super().__init__()
+        if resident not in (True, False, "auto"):
+            raise ValueError(f"resident is true, false or auto, got {resident!r}")
         self.data = data
         self.batch_size = batch_size
         self.num_workers = num_workers
         self.cache_root = Path(cache_root).expanduser()
+        self.resident = resident
         self.augmentation = augmentation
         self.preparation_workers = _usable_cores() if preparation_workers is None else preparation_workers
         self.projection: SphericalProjection = replace(
             data.projection, height=height or data.projection.height, width=width or data.projection.width
         )
         self.val_sequences: list[Sequence] = []
+        self._resident_maps: Int16[Tensor, "n 3 h w"] | None = None
 
     def prepare_data(self) -> None:
         """Make the data, where it is made on the spot, and the caches; Lightning calls it in one process only.
@@ -76,18 +88,48 @@ class OdometryDataModule(LightningDataModule):
 
     def setup(self, stage: str | None = None) -> None:
         """Open sequences and caches; called in every process."""
-        train = [self.data.sequence(name) for name in self.data.train_sequences]
-        # One sequence without ground truth and the batches of all go without: a batch holds the same for every pair.
-        labelled = all(sequence.T_world_lidar is not None for sequence in train)
-        pairs = [self._pairs(s, labelled, self.augmentation) for s in train]
-        if not sum(map(len, pairs)):
+        names = dict.fromkeys([*self.data.train_sequences, *self.data.val_sequences])
+        sequences = {name: self.data.sequence(name) for name in names}
+        self._maps = cache.VertexMaps(*(file for s in sequences.values() for file in self._vertex_maps(s).files))
+        ends = accumulate(map(len, sequences.values()))
+        rows = {name: range(end - len(sequences[name]), end) for name, end in zip(sequences, ends, strict=True)}
+
+        def pairs(names: Collection[str], max_skip: int = 1) -> ScanPairs:
+            poses = [T for name in names if (T := sequences[name].T_world_lidar) is not None]
+            # One sequence without ground truth and the batches of all go without: a batch holds the same for each pair.
+            return ScanPairs([rows[name] for name in names], poses if len(poses) == len(names) else None, max_skip)
+
+        self._train_pairs = pairs(self.data.train_sequences, self.augmentation.max_skip if self.augmentation else 1)
+        if not len(self._train_pairs):
             raise UserError(
                 f"{self.data.title}: no pair of scans to train on in sequences {list(self.data.train_sequences)}"
                 "\n  change: data.train_sequences, or data.max_frames"
             )
-        self._train_pairs: ConcatDataset[Pair] = ConcatDataset(pairs)
-        self.val_sequences = [self.data.sequence(name) for name in self.data.val_sequences]
-        self._val_pairs = [self._pairs(s, s.T_world_lidar is not None) for s in self.val_sequences]
+        self.val_sequences = [sequences[name] for name in self.data.val_sequences]
+        self._val_pairs = [pairs([name]) for name in self.data.val_sequences]
+        if self.trainer is not None:
+            self.keep_maps_on(self.trainer.strategy.root_device)
+
+    def keep_maps_on(self, device: torch.device) -> None:
+        """Copy all vertex maps to the device that trains, if `resident` says so; `setup` does it for its trainer.
+
+        Raises:
+            UserError: its memory is too small.
+        """
+        needed = self._maps.nbytes
+        if self.resident is False or (self.resident == "auto" and needed > _RESIDENT_SHARE * _free_memory(device)):
+            return
+        try:
+            self._resident_maps = self._maps.to(device)
+        except torch.OutOfMemoryError as error:
+            raise UserError(
+                f"datamodule.resident=true: {needed / 1e9:.1f} GB of vertex maps do not fit into the memory of {device}"
+                "\n  change: datamodule.resident=false, or train on fewer scans (data.max_frames)"
+            ) from error
+
+    def teardown(self, stage: str | None = None) -> None:
+        """Give the device's memory back: another training of the same process may follow."""
+        self._resident_maps = None
 
     def train_dataloader(self) -> DataLoader[Pair]:
         """Shuffled pairs of all training sequences; a last, smaller batch is left out."""
@@ -97,33 +139,50 @@ class OdometryDataModule(LightningDataModule):
         """One loader per validation sequence, in the order of `val_sequences`."""
         return [self._loader(pairs) for pairs in self._val_pairs]
 
-    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
-        """Decode vertex maps to metres, on the device: half the traffic to it."""
-        maps: dict[str, Tensor] = {key: cache.decode(batch[key]) for key in ("reference", "target")}
-        return {**batch, **maps}
+    def on_after_batch_transfer(self, batch: Pair, dataloader_idx: int) -> Pair:
+        """Complete a batch, see `completed`."""
+        return self.completed(batch, augmented=self.trainer is not None and bool(self.trainer.training))
 
-    def _pairs(self, sequence: Sequence, labelled: bool, augmentation: Augmentation | None = None) -> ScanPairs:
-        step = None if augmentation is None else augmentation.step
-        T_world_lidar = sequence.T_world_lidar if labelled else None
-        return ScanPairs(self._vertex_maps(sequence), T_world_lidar, augmentation, step)
+    def completed(self, batch: Pair, augmented: bool) -> Pair:
+        """A batch of a loader, moved to the device, as the network gets it: vertex maps in metres.
+
+        Args:
+            batch: holds encoded maps, or the rows of resident ones.
+            augmented: whether it is changed by chance, as those of training are.
+        """
+        if self._resident_maps is not None:
+            batch = with_maps(batch, self._resident_maps)
+        batch = {**batch, "reference": cache.decode(batch["reference"]), "target": cache.decode(batch["target"])}
+        return self.augmentation(batch) if augmented and self.augmentation is not None else batch
 
     def _vertex_maps(self, sequence: Sequence) -> cache.VertexMaps:
         return cache.cached_vertex_maps(sequence, self.projection, self.cache_root, self.preparation_workers)
 
-    def _loader(
-        self, pairs: ScanPairs | ConcatDataset[Pair], shuffle: bool = False, drop_last: bool = False
-    ) -> DataLoader[Pair]:
+    def _loader(self, pairs: ScanPairs, shuffle: bool = False, drop_last: bool = False) -> DataLoader[Pair]:
+        is_resident = self._resident_maps is not None
+        # a few numbers are sooner looked up than handed over by another process
+        num_workers = 0 if is_resident else self.num_workers
         return DataLoader(
             pairs,
             batch_size=self.batch_size,
             shuffle=shuffle,
             drop_last=drop_last,
-            num_workers=self.num_workers,
+            collate_fn=default_convert if is_resident else partial(with_maps, maps=self._maps),
+            num_workers=num_workers,
             # of training only until the epoch ends: new ones begin with the main process' random numbers, which a
             # resumed training takes up
-            persistent_workers=self.num_workers > 0 and not shuffle,
+            persistent_workers=num_workers > 0 and not shuffle,
+            # validation starts its workers once a run, however often that was resumed: not with numbers of that stream
+            generator=None if shuffle else torch.Generator(),
             pin_memory=torch.cuda.is_available(),
         )
+
+
+def _free_memory(device: torch.device) -> int:
+    """Bytes for all vertex maps [B]; none but on a GPU, where reading them elsewhere and sending them takes time."""
+    if device.type != "cuda":
+        return 0
+    return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
 def _require_ground_truth(sequences: Mapping[str, Sequence]) -> None:

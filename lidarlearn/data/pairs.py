@@ -1,9 +1,10 @@
 """Pairs of neighbouring scans, what a network that regresses relative poses trains on."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import TypedDict
 
-from jaxtyping import Float, Shaped
+import torch
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.utils.data import Dataset
 from typing_extensions import NotRequired
@@ -16,27 +17,27 @@ class Pair(TypedDict):
     """Two neighbouring scans, or a batch of such.
 
     Keys:
-        reference: vertex map of the earlier scan, as cached: multiples of `cache.QUANTUM_M`, zeros where no point fell.
+        reference: vertex map of the earlier scan [m], zeros where no point fell. Of what `ScanPairs` gives, its row
+            among all vertex maps, see `with_maps`.
         target: vertex map of the new scan, likewise.
         index: the reference's place in its sequence.
         T_ref_new: true relative pose, float64; only with ground truth.
     """
 
-    reference: Shaped[Tensor, "*batch 3 h w"]
-    target: Shaped[Tensor, "*batch 3 h w"]
-    index: int | Tensor
+    reference: Shaped[Tensor, "*map"]
+    target: Shaped[Tensor, "*map"]
+    index: Int[Tensor, "*batch"]
     T_ref_new: NotRequired[Float[Tensor, "*batch 4 4"]]
 
 
 class ScanPairs(Dataset[Pair]):
-    """The pairs (i, i + 1) of one sequence, in order.
+    """The pairs (i, i + 1) of sequences, in order, a batch of them at once and in numbers only.
 
     Args:
-        vertex_maps: of all its scans.
-        T_world_lidar: ground-truth poses of all its scans; None to go without.
-        augment: what is done to each pair.
-        step: asked for each pair, how many scans its second one is after its first; near the end of the sequence it
-            is as many as there are.
+        rows: of each sequence's scans among all vertex maps.
+        T_world_lidar: ground-truth poses of each sequence's scans; None to go without.
+        max_skip: the second scan of a pair is by chance up to so many after the first; near the end of a sequence as
+            many as there are.
 
     Raises:
         ValueError: the numbers of scans and poses differ, or a pose is not finite.
@@ -44,24 +45,42 @@ class ScanPairs(Dataset[Pair]):
 
     def __init__(
         self,
-        vertex_maps: VertexMaps,
-        T_world_lidar: Float[Tensor, "n 4 4"] | None,
-        augment: Callable[[Pair], Pair] | None = None,
-        step: Callable[[], int] | None = None,
+        rows: Sequence[range],
+        T_world_lidar: Sequence[Float[Tensor, "_ 4 4"]] | None,
+        max_skip: int = 1,
     ) -> None:
-        if T_world_lidar is not None and (len(T_world_lidar) != len(vertex_maps) or not T_world_lidar.isfinite().all()):
-            raise ValueError(
-                f"{len(vertex_maps)} scans need as many finite ground-truth poses, got {len(T_world_lidar)}"
-            )
-        self.vertex_maps, self.T_world_lidar = vertex_maps, T_world_lidar
-        self.augment, self.step = augment, step
+        self.max_skip = max_skip
+        none = torch.zeros(0, dtype=torch.long)
+        self._references = torch.cat([none, *(torch.tensor(r[:-1], dtype=torch.long) for r in rows)])
+        self._firsts = torch.cat([none, *(torch.full((len(r[:-1]),), r.start) for r in rows)])
+        self._lasts = torch.cat([none, *(torch.full((len(r[:-1]),), r.stop - 1) for r in rows)])
+        self._T_world_lidar = None if T_world_lidar is None else _by_row(rows, T_world_lidar)
 
     def __len__(self) -> int:
-        return max(len(self.vertex_maps) - 1, 0)
+        return len(self._references)
 
-    def __getitem__(self, index: int) -> Pair:
-        second = index + 1 if self.step is None else min(index + self.step(), len(self))
-        pair = Pair(reference=self.vertex_maps[index], target=self.vertex_maps[second], index=index)
-        if self.T_world_lidar is not None:
-            pair["T_ref_new"] = se3.inverse(self.T_world_lidar[index]) @ self.T_world_lidar[second]
-        return pair if self.augment is None else self.augment(pair)
+    def __getitems__(self, indices: list[int]) -> Pair:
+        """A batch of pairs, as torch's loaders ask for it."""
+        chosen = torch.tensor(indices)
+        reference = self._references[chosen]
+        step = 1 if self.max_skip == 1 else torch.randint(1, self.max_skip + 1, reference.shape)
+        target = torch.minimum(reference + step, self._lasts[chosen])
+        batch = Pair(reference=reference, target=target, index=reference - self._firsts[chosen])
+        if self._T_world_lidar is not None:
+            batch["T_ref_new"] = se3.inverse(self._T_world_lidar[reference]) @ self._T_world_lidar[target]
+        return batch
+
+
+def with_maps(batch: Pair, maps: VertexMaps | Shaped[Tensor, "n 3 h w"]) -> Pair:
+    """The batch with vertex maps in place of their rows, as encoded, from files or from the memory of its device."""
+    return {**batch, "reference": maps[batch["reference"]], "target": maps[batch["target"]]}
+
+
+def _by_row(rows: Sequence[range], T_world_lidar: Sequence[Float[Tensor, "_ 4 4"]]) -> Float[Tensor, "m 4 4"]:
+    """The pose of each row; not a number for those of other sequences."""
+    by_row = torch.full((max((r.stop for r in rows), default=0), 4, 4), torch.nan, dtype=torch.float64)
+    for scans, poses in zip(rows, T_world_lidar, strict=True):
+        if len(poses) != len(scans) or not poses.isfinite().all():
+            raise ValueError(f"{len(scans)} scans need as many finite ground-truth poses, got {len(poses)}")
+        by_row[scans.start : scans.stop] = poses
+    return by_row

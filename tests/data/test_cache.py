@@ -109,7 +109,7 @@ def test_a_changed_reader_makes_another_cache(tmp_path, monkeypatch):
     digests = []
     monkeypatch.setattr(cache, "source_digest", lambda *files: digests.append(files) or "of other code")
     again = CountingSequence()
-    assert cached_vertex_maps(again, SMALL, tmp_path).file != first.file and again.read == list(range(7))
+    assert cached_vertex_maps(again, SMALL, tmp_path).files != first.files and again.read == list(range(7))
     assert digests[0] == (Path(__file__), Path(cache.__file__))
 
 

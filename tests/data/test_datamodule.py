@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lidarlearn.commands.train import train
+from lidarlearn.data.augmentation import Augmentation
 from lidarlearn.data.datamodule import OdometryDataModule
 from lidarlearn.data.errors import DataSetNotFoundError
 from lidarlearn.errors import UserError
@@ -19,6 +20,7 @@ def make(tmp_path, drives=None, **settings):
     module = OdometryDataModule(drives or BoxDrives(frames=9), cache_root=str(tmp_path), **settings)
     module.prepare_data()
     module.setup()
+    module.keep_maps_on(torch.device("cpu"))
     return module
 
 
@@ -70,6 +72,54 @@ def test_labels_are_left_out_where_one_sequence_has_none(tmp_path):
     assert "T_ref_new" in next(iter(module.val_dataloader()[0]))
 
 
+EVERYTHING = Augmentation(mirror=True, turn=True, reverse=True, max_skip=3, drop_out=0.3)
+
+
+@pytest.mark.parametrize("augmentation", [None, EVERYTHING])
+def test_batches_are_the_same_where_the_maps_are_kept_on_the_device(tmp_path, augmentation):
+    modules = [make(tmp_path, resident=resident, augmentation=augmentation) for resident in (False, True)]
+    trained, validated = [], []
+    for module in modules:
+        torch.manual_seed(0)
+        trained.append([module.completed(batch, augmented=True) for batch in module.train_dataloader()])
+        validated.append([module.completed(batch, augmented=False) for batch in module.val_dataloader()[0]])
+    for batches in (trained, validated):
+        for read, looked_up in zip(*batches, strict=True):
+            assert read.keys() == looked_up.keys() == {"reference", "target", "index", "T_ref_new"}
+            assert all(torch.equal(read[key], looked_up[key]) for key in read)
+    assert next(iter(modules[1].train_dataloader()))["reference"].shape == (4,)  # numbers alone are handed over
+
+
+@pytest.mark.parametrize(("resident", "is_kept"), [("auto", False), (True, True), (False, False)])
+def test_maps_are_kept_on_a_cpu_only_where_that_is_asked_for(tmp_path, resident, is_kept):
+    rows = next(iter(make(tmp_path, resident=resident).val_dataloader()[0]))["reference"]
+    assert (rows.dim() == 1) == is_kept
+
+
+@pytest.mark.parametrize(("free", "is_kept"), [(3.0, True), (1.5, False)])
+def test_maps_are_kept_on_a_gpu_where_they_take_less_than_half_of_it(tmp_path, monkeypatch, free, is_kept):
+    module = make(tmp_path)
+    monkeypatch.setattr("lidarlearn.data.datamodule._free_memory", lambda _: int(free * module._maps.nbytes))
+    module.keep_maps_on(torch.device("cpu"))
+    assert (next(iter(module.val_dataloader()[0]))["reference"].dim() == 1) == is_kept
+
+
+def test_maps_that_do_not_fit_are_told(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    module = make(tmp_path)
+    module.resident = True
+    monkeypatch.setattr("lidarlearn.data.cache.VertexMaps.to", full)
+    with pytest.raises(UserError, match=r"do not fit into the memory of cpu(.|\n)*datamodule\.resident=false"):
+        module.keep_maps_on(torch.device("cpu"))
+
+
+def test_another_word_than_auto_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="true, false or auto, got 'always'"):
+        make(tmp_path, resident="always")
+
+
 @pytest.mark.filterwarnings(
     "ignore:This process:DeprecationWarning"
 )  # fork beside torch's threads, from Python 3.12 on
@@ -77,6 +127,16 @@ def test_workers_load_the_same(tmp_path):
     plain, loaded = make(tmp_path), make(tmp_path, num_workers=2)
     for a, b in zip(plain.val_dataloader()[0], loaded.val_dataloader()[0], strict=True):
         torch.testing.assert_close(a["reference"], b["reference"])
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_validation_leaves_the_stream_of_random_numbers_alone(tmp_path, num_workers):
+    """Else how often workers have started would decide about the next epoch's batches."""
+    module = make(tmp_path, num_workers=num_workers)
+    state = torch.get_rng_state()
+    list(module.val_dataloader()[0])
+    assert torch.equal(state, torch.get_rng_state())
 
 
 class WithoutTheLast(BoxDrives):
