@@ -9,6 +9,9 @@ from torch.nn.functional import pad
 
 from lidarlearn.geometry.ranges import squared_ranges
 
+_Symmetric = tuple[Tensor, ...]  # components xx, xy, xz, yy, yz, zz of symmetric 3x3 matrices
+_Vector = tuple[Tensor, Tensor, Tensor]
+
 
 @dataclass(frozen=True)
 class PlaneFit:
@@ -29,10 +32,15 @@ def fit_planes(covariances: Float[Tensor, "*batch 6"]) -> PlaneFit:
     Closed form and branch-free, so it runs at memory speed on both devices where a batched eigensolver does not: the
     adjugate has the same eigenvectors with eigenvalues l1 l2 >> l0 l2 >= l0 l1, so a few squarings leave the normal
     alone. The error is (l0 / l1)^8: nothing for a plane, and a set without a plane has no normal to be wrong about.
-    Components are kept apart: fastest where they lie apart in memory, too.
+    Components are kept apart: fastest where they lie apart in memory, too, and what a compiler can fuse into one pass.
     """
-    s = covariances.unbind(-1)
-    tiny = torch.finfo(covariances.dtype).tiny
+    normal, variances = _fit(covariances.unbind(-1))
+    return PlaneFit(torch.stack(normal).movedim(0, -1), torch.stack(variances).movedim(0, -1))
+
+
+def _fit(s: _Symmetric) -> tuple[_Vector, _Vector]:
+    """Normals and variances by their components, see `fit_planes`."""
+    tiny = torch.finfo(s[0].dtype).tiny
     scale = (s[0] + s[3] + s[5]).clamp(min=tiny)
     s = tuple(component / scale for component in s)
     adjugate = power = _adjugate(s)
@@ -51,8 +59,7 @@ def fit_planes(covariances: Float[Tensor, "*batch 6"]) -> PlaneFit:
     root = (rest * rest - 4 * product).clamp(min=0).sqrt()
     l2 = (rest + root) / 2
     l1 = product / l2.clamp(min=tiny)
-    variances = torch.stack([l0 * scale, l1 * scale, l2 * scale]).movedim(0, -1)
-    return PlaneFit(torch.stack(normal).movedim(0, -1), variances)
+    return normal, (l0 * scale, l1 * scale, l2 * scale)
 
 
 def normal_map(
@@ -76,27 +83,20 @@ def normal_map(
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood".
     """
-    batch, (h, w) = vertex_map.shape[:-3], vertex_map.shape[-2:]
-    channels = vertex_map.reshape(-1, 3, h, w).transpose(0, 1).contiguous()
+    channels = vertex_map.movedim(-3, 0)
     sums = _window_moments(channels, window, max_range_jump)
     beside, above, diagonal = sums.counts
     count = 1 + beside + above + diagonal
-    x, y, z = sums.first / count
-    squares = sums.squares / count
-    products = sums.products / count
-    covariances = torch.stack(
-        [squares[0] - x * x, products[0] - x * y, products[1] - x * z, squares[1] - y * y, products[2] - y * z,
-         squares[2] - z * z]
-    )  # fmt: skip
-    plane = fit_planes(covariances.movedim(0, -1))
-    across, along = plane.variances[..., 0], plane.variances[..., 1]
+    (x, y, z), (xx, yy, zz) = sums.first / count, sums.squares / count
+    (xy, xz), yz = sums.xy_xz / count, sums.yz / count
+    normal, (across, along, _) = _fit((xx - x * x, xy - x * y, xz - x * z, yy - y * y, yz - y * z, zz - z * z))
     spans_patch = (above + diagonal >= 2) & (beside + diagonal >= 2)
     defined = (count >= 5) & spans_patch & (along > 0) & (across <= max_roughness**2 * along)
     defined &= (channels != 0).any(0)
-    normals = plane.normals.movedim(-1, 0)
+    normals = torch.stack(normal)
     away = (normals * channels).sum(0) > 0
     normals = normals * torch.where(away, -1.0, 1.0).to(normals.dtype) * defined
-    return normals.transpose(0, 1).reshape(*batch, 3, h, w)
+    return normals.movedim(0, -3)
 
 
 @dataclass(frozen=True)
@@ -107,23 +107,29 @@ class _Moments:
         counts: how many lie in the same row, in the same column, and in neither.
         first: of the offsets x, y, z.
         squares: of xx, yy, zz.
-        products: of xy, xz, yz.
+        xy_xz: of xy, xz.
+        yz: of yz.
     """
 
-    counts: Float[Tensor, "3 batch h w"]
-    first: Float[Tensor, "3 batch h w"]
-    squares: Float[Tensor, "3 batch h w"]
-    products: Float[Tensor, "3 batch h w"]
+    counts: list[Float[Tensor, "*batch h w"]]
+    first: Float[Tensor, "3 *batch h w"]
+    squares: Float[Tensor, "3 *batch h w"]
+    xy_xz: Float[Tensor, "2 *batch h w"]
+    yz: Float[Tensor, "*batch h w"]
 
 
-def _window_moments(channels: Float[Tensor, "3 batch h w"], window: tuple[int, int], max_range_jump: float) -> _Moments:
+def _window_moments(
+    channels: Float[Tensor, "3 *batch h w"], window: tuple[int, int], max_range_jump: float
+) -> _Moments:
     rows, columns = window[0] // 2, window[1] // 2
     h, w = channels.shape[-2:]
     ranges = squared_ranges(channels.movedim(0, -1)).sqrt_()
     ranges = torch.where(ranges > 0, ranges, torch.inf)  # an empty pixel is near to nothing, not even to another one
     neighbours, neighbours_ranges = _padded(channels, rows, columns, 0.0), _padded(ranges, rows, columns, torch.inf)
     tolerance = max_range_jump * ranges
-    counts, first, squares, products = (torch.zeros_like(channels) for _ in range(4))
+    # Sums that are added to in part are tensors of their own: what adds to a part of one, a compiler copies whole.
+    counts, yz = [torch.zeros_like(ranges) for _ in range(3)], torch.zeros_like(ranges)
+    first, squares, xy_xz = (torch.zeros_like(part) for part in (channels, channels, channels[1:]))
     for row in range(2 * rows + 1):
         for column in range(2 * columns + 1):
             if (row, column) == (rows, columns):
@@ -134,9 +140,9 @@ def _window_moments(channels: Float[Tensor, "3 batch h w"], window: tuple[int, i
             d = (neighbours[part] - channels).mul_(used)
             first += d
             squares.addcmul_(d, d)
-            products[:2].addcmul_(d[:1], d[1:])
-            products[2].addcmul_(d[1], d[2])
-    return _Moments(counts, first, squares, products)
+            xy_xz.addcmul_(d[:1], d[1:])
+            yz.addcmul_(d[1], d[2])
+    return _Moments(counts, first, squares, xy_xz, yz)
 
 
 def _padded(
@@ -145,10 +151,6 @@ def _padded(
     """Rows of a value above and below, columns from the other side of the seam."""
     wrapped = torch.cat([images[..., images.shape[-1] - columns :], images, images[..., :columns]], dim=-1)
     return pad(wrapped, (0, 0, rows, rows), value=value)
-
-
-_Symmetric = tuple[Tensor, ...]  # components xx, xy, xz, yy, yz, zz of symmetric 3x3 matrices
-_Vector = tuple[Tensor, Tensor, Tensor]
 
 
 def _adjugate(s: _Symmetric) -> _Symmetric:

@@ -1,7 +1,6 @@
 """Spherical projection of a scan into an image, one nearest point per pixel."""
 
 import math
-import sys
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +9,6 @@ from torch import Tensor
 
 from lidarlearn.geometry.ranges import squared_ranges
 
-_LOWER, _UPPER = (0, 1) if sys.byteorder == "little" else (1, 0)  # halves of a 64-bit integer
 _NOTHING = torch.iinfo(torch.int64).max  # its lower half is -1
 
 
@@ -88,12 +86,11 @@ def nearest_per_slot(
         ranges: of each point, not negative; its square will do.
         count: number of slots.
     """
-    keys = torch.empty(*ranges.shape, 2, dtype=torch.int32, device=ranges.device)
-    keys[..., _UPPER] = ranges.view(torch.int32)  # ordered like the floats
-    keys[..., _LOWER] = torch.arange(ranges.shape[-1], dtype=torch.int32, device=ranges.device)
+    # non-negative floats are ordered like their bits
+    keys = ranges.view(torch.int32).long().bitwise_left_shift_(32)
+    keys += torch.arange(ranges.shape[-1], device=ranges.device)
     nearest = torch.full((*ranges.shape[:-1], count), _NOTHING, device=ranges.device)
-    nearest.scatter_reduce_(-1, slots.long(), keys.view(torch.int64)[..., 0], "amin")
-    return nearest.view(torch.int32)[..., _LOWER::2]
+    return nearest.scatter_reduce_(-1, slots.long(), keys, "amin").int()  # the lower half
 
 
 def activated(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Bool[Tensor, "*batch h w"]:

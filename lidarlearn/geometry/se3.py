@@ -52,6 +52,18 @@ def transform(T_target_source: Float[Tensor, "*#batch 4 4"], points: Float[Tenso
     return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
 
 
+def transform_map(
+    T_target_source: Float[Tensor, "*#batch 4 4"], vertex_map: Float[Tensor, "*#batch 3 h w"]
+) -> Float[Tensor, "*batch 3 h w"]:
+    """The points of vertex maps in the target frame, those of empty pixels, too.
+
+    Written out where `transform` multiplies matrices: a compiler fuses it, and its gradient, with what is around.
+    """
+    x, y, z = vertex_map.unsqueeze(-4).unbind(-3)
+    T = T_target_source[..., :3, :, None, None].to(vertex_map)
+    return T[..., 0, :, :] * x + T[..., 1, :, :] * y + T[..., 2, :, :] * z + T[..., 3, :, :]
+
+
 def hat(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The matrix W of the cross product, W w = v x w."""
     eye = torch.eye(3, dtype=v.dtype, device=v.device)

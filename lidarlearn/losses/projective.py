@@ -68,7 +68,7 @@ class ProjectiveLoss(nn.Module, ABC):
         aligned = reproject(se3.from_euler(parameters), target, projection)
         with torch.no_grad():
             normals = normal_map(reference, self.normal_window, self.max_range_jump, self.max_roughness)
-            used = activated(reference) & activated(aligned) & activated(normals)
+            used = activated(aligned) & activated(normals)  # which only activated pixels of the reference have
         offsets = aligned - reference
         residuals = (offsets * normals).sum(dim=1)
         squared_distances = (offsets * offsets).sum(dim=1)
@@ -93,7 +93,11 @@ def reproject(
     projection: SphericalProjection,
 ) -> Float[Tensor, "batch 3 h w"]:
     """The target's points in the reference frame, in the pixels where the reference would see them."""
-    points = se3.transform(T_ref_new, target.flatten(2).mT)
-    # Empty pixels are zeros; transformed they would become points, back at the origin they fall into no pixel.
-    points = torch.where(activated(target).flatten(1)[..., None], points, 0.0)
-    return projection.vertex_map(points)
+    with torch.no_grad():
+        points = se3.transform_map(T_ref_new, target)
+        # Empty pixels are zeros; transformed they would become points, back at the origin they fall into no pixel.
+        points = torch.where(activated(target)[:, None], points, 0.0)
+        nearest = projection.nearest_points(points.flatten(2).mT)[:, None]
+    # Chosen first and transformed then, once more: so no gradient has to find its way back to where a point came from.
+    chosen = target.flatten(2).gather(-1, nearest.clamp(min=0).flatten(2).expand(-1, 3, -1)).view_as(target)
+    return torch.where(nearest >= 0, se3.transform_map(T_ref_new, chosen), 0.0)

@@ -162,3 +162,10 @@ def test_gradient_of_log_is_finite_at_the_identity_itself():
 def test_half_turns_are_as_far_as_log_reaches():
     xi = random_twists(8, angle=math.pi - 1e-5)
     assert_close(se3.log(se3.exp(xi)), xi, atol=1e-8)
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_vertex_maps_are_transformed_point_by_point(batch):
+    T = se3.exp(random_twists(*batch))
+    maps = torch.randn(*batch, 3, 4, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    assert_close(se3.transform_map(T, maps).flatten(-2), se3.transform(T, maps.flatten(-2).mT).mT)

@@ -167,3 +167,24 @@ def test_reprojection_by_the_identity_changes_nothing(pair):
 def test_empty_pixels_do_not_become_points():
     target = torch.zeros(1, 3, FINE.height, FINE.width)
     assert not reproject(se3.from_euler(torch.ones(1, 6)), target, FINE).any()
+
+
+def test_reprojection_is_that_of_the_transformed_points(pair):
+    """The same image as `vertex_map` makes of the points, and the same pull on the motion."""
+    target = torch.cat([pair[1], pair[0] * (torch.rand(FINE.height, FINE.width) < 0.5)])
+    weights = torch.randn(target.shape, generator=torch.Generator().manual_seed(0))
+    images, pulls = [], []
+    for way in ("map", "points"):
+        parameters = torch.tensor([[0.3, 0.1, 0, 0, 0.01, 0.1], [0, 0, 0.2, 0.05, 0, -2.0]], requires_grad=True)
+        T = se3.from_euler(parameters)
+        if way == "map":
+            image = reproject(T, target, FINE)
+        else:
+            points = se3.transform(T, target.flatten(2).mT)
+            image = FINE.vertex_map(torch.where(activated(target).flatten(1)[..., None], points, 0.0))
+        (image * weights).sum().backward()
+        images.append(image.detach())
+        pulls.append(parameters.grad)
+    same = ((images[0] - images[1]).abs().amax(1) < 1e-4).float().mean()
+    assert same > 0.999  # points exactly on a pixel's border may change sides
+    torch.testing.assert_close(pulls[0], pulls[1], rtol=0.01, atol=0.01 * float(pulls[1].abs().max()))
