@@ -16,6 +16,7 @@ _NOT_FOR_THE_USER = (
     r".*could not find the monitored key.*",  # likewise, or a first epoch that is not validated yet
     r".*Consider setting `persistent_workers=True`.*",  # they are, where there are workers
     r".*The dirpath has changed from.*",  # a run that resumes may have a new folder
+    r".*TensorFloat32 tensor cores.*",  # scans need 32 bits, the network has trainer.precision
     r".*Detected call of `lr_scheduler.step\(\)` before `optimizer.step\(\)`.*",  # 16 bits skip overflowing first steps
 )
 

@@ -180,6 +180,18 @@ def test_a_best_checkpoint_that_does_not_compare_is_kept(run, tmp_path):
     assert (tmp_path / "checkpoints" / "best_before_epoch_004.ckpt").read_bytes() == best.read_bytes()
 
 
+def test_maps_kept_on_the_device_train_the_same(tmp_path, capsys):
+    losses = []
+    for resident in ("true", "false"):
+        config = configured(
+            tmp_path / resident, "trainer.max_epochs=1", f"datamodule.resident={resident}", frames=9, val_sequences=[]
+        )
+        train(config, data_name="boxes")
+        losses.append(curves(tmp_path / resident)["train/loss_step"])
+    assert losses[0] == losses[1]
+    assert capsys.readouterr().out.count("vertex maps to cpu: 18 scans") == 1
+
+
 @pytest.mark.slow
 def test_two_runs_from_one_seed_are_the_same(tmp_path):
     losses = []
