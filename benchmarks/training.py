@@ -1,8 +1,8 @@
 """What loading, projection and loss cost a training, compared with the network's bare steps on tensors in memory.
 
 Three kinds of steps are timed in turns: as `train.py` does them, fed from the vertex-map cache (on a GPU with resident
-maps and a compiled loss, its defaults there, and `trainer.precision=bf16-mixed`); the same on batches in memory; and the
-network's forward and backward pass and the optimizer's step alone, for a loss that costs nothing.
+maps and a compiled loss, its defaults there, and with `trainer.precision=bf16-mixed`); the same on batches in memory;
+and the network's forward and backward pass and the optimizer's step alone, for a loss that costs nothing.
 """
 
 import statistics
