@@ -116,7 +116,7 @@ class OdometryDataModule(LightningDataModule):
         Raises:
             UserError: its memory is too small.
         """
-        needed = self._maps.nbytes
+        self._resident_maps, needed = None, self._maps.nbytes
         if self.resident is False or (self.resident == "auto" and needed > _RESIDENT_SHARE * _free_memory(device)):
             return
         try:
@@ -179,7 +179,7 @@ class OdometryDataModule(LightningDataModule):
 
 
 def _free_memory(device: torch.device) -> int:
-    """Bytes for all vertex maps [B]; none but on a GPU, where reading them elsewhere and sending them takes time."""
+    """What a GPU has to share [B]; a CPU nothing: it reads the files from its own memory as it is."""
     if device.type != "cuda":
         return 0
     return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)

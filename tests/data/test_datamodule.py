@@ -88,6 +88,8 @@ def test_batches_are_the_same_where_the_maps_are_kept_on_the_device(tmp_path, au
             assert read.keys() == looked_up.keys() == {"reference", "target", "index", "T_ref_new"}
             assert all(torch.equal(read[key], looked_up[key]) for key in read)
     assert next(iter(modules[1].train_dataloader()))["reference"].shape == (4,)  # numbers alone are handed over
+    modules[1].teardown()
+    assert next(iter(modules[1].train_dataloader()))["reference"].shape == (4, 3, 16, 96)
 
 
 @pytest.mark.parametrize(("resident", "is_kept"), [("auto", False), (True, True), (False, False)])
