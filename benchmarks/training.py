@@ -42,7 +42,7 @@ def measure(options: report.Options) -> list[Row]:
     """The default network of simulated drives and the paper's, on scans of a simulated town."""
     frames = 60 if options.quick else 220
     on_gpu = options.device.type == "cuda"
-    sizes = ((32, 360, 512), (64, 720, 256)) if on_gpu else ((32, 360, 16), (64, 720, 8))
+    sizes = ((32, 360, 1024), (64, 720, 512)) if on_gpu else ((32, 360, 16), (64, 720, 8))
     with tempfile.TemporaryDirectory() as folder:
         return [_measure(options, folder, frames, *size) for size in (sizes[:1] if options.quick else sizes)]
 

@@ -174,7 +174,7 @@ class OdometryDataModule(LightningDataModule):
             persistent_workers=num_workers > 0 and not shuffle,
             # validation starts its workers once a run, however often that was resumed: not with numbers of that stream
             generator=None if shuffle else torch.Generator(),
-            pin_memory=torch.cuda.is_available(),
+            pin_memory=torch.cuda.is_available() and not is_resident,
         )
 
 

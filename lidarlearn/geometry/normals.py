@@ -83,7 +83,7 @@ def normal_map(
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood".
     """
-    channels = vertex_map.movedim(-3, 0)
+    channels = vertex_map.contiguous().movedim(-3, 0)
     sums = _window_moments(channels, window, max_range_jump)
     beside, above, diagonal = sums.counts
     count = 1 + beside + above + diagonal

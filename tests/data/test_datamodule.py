@@ -12,6 +12,7 @@ from lidarlearn.data.errors import DataSetNotFoundError
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
 from tests.box_world import SMALL, BoxDrives
+from tests.gpu import on_gpu
 from tests.training.runs import configured
 
 
@@ -166,3 +167,16 @@ def test_missing_labels_are_told_before_anything_is_projected(tmp_path):
 def test_nothing_to_train_on_is_an_error_that_names_the_setting(tmp_path):
     with pytest.raises(UserError, match=r"data\.train_sequences"):
         make(tmp_path, BoxDrives(frames=9, train_sequences=()))
+
+
+@on_gpu
+def test_a_gpu_keeps_the_maps_and_gives_the_same_batches(tmp_path):
+    batches = []
+    for device in ("cpu", "cuda"):
+        module = make(tmp_path)
+        module.keep_maps_on(torch.device(device))
+        torch.manual_seed(0)
+        batch = next(iter(module.train_dataloader()))
+        batches.append(module.completed({key: value.to(device) for key, value in batch.items()}, augmented=False))
+    assert batches[1]["reference"].is_cuda
+    assert all(torch.equal(batches[0][key], batches[1][key].cpu()) for key in batches[0])

@@ -10,6 +10,7 @@ from lidarlearn.geometry import se3
 from lidarlearn.losses.weighted_icp import WeightedIcpLoss
 from lidarlearn.training.unsupervised import UnsupervisedModule
 from tests.box_world import SMALL, cast
+from tests.gpu import on_gpu
 
 
 def module(**settings) -> UnsupervisedModule:
@@ -137,3 +138,40 @@ assert counters["stats"]["unique_graphs"] == 2 and not counters["graph_break"], 
 def test_compiled_it_is_the_same_loss():
     """In a process without checks of shapes, which do not compile."""
     subprocess.run([sys.executable, "-c", _COMPARISON], check=True)
+
+
+@on_gpu
+def test_a_gpu_computes_the_same_loss_and_gradient():
+    here, there = estimates(), estimates().detach().cuda().requires_grad_()
+    on_gpu = {key: maps.cuda() for key, maps in batch().items()}
+    losses = [
+        module().compute_loss(here, batch()).loss,
+        module(compile_loss=False).cuda().compute_loss(there, on_gpu).loss,
+    ]
+    for loss in losses:
+        loss.backward()
+    torch.testing.assert_close(losses[1].cpu(), losses[0], rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(there.grad.cpu(), here.grad, rtol=1e-2, atol=1e-5)
+
+
+_ON_GPU = """
+import torch
+from tests.training.test_unsupervised import batch, estimates, module
+
+results = []
+for compile_loss in (True, False):
+    trained, parameters = module(compile_loss=compile_loss).cuda(), estimates().detach().cuda().requires_grad_()
+    loss = trained.compute_loss(parameters, {key: maps.cuda() for key, maps in batch().items()}).loss
+    loss.backward()
+    results.append((loss, parameters.grad))
+    assert (trained._training_loss == trained.loss.forward) != compile_loss, "it was not compiled"
+(fast, pull), (slow, slow_pull) = results
+torch.testing.assert_close(fast, slow, rtol=1e-3, atol=0)
+torch.testing.assert_close(pull, slow_pull, rtol=1e-2, atol=1e-2 * float(slow_pull.abs().max()))
+"""
+
+
+@on_gpu
+@pytest.mark.slow
+def test_compiled_for_a_gpu_it_is_the_same_loss():
+    subprocess.run([sys.executable, "-c", _ON_GPU], check=True)
