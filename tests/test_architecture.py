@@ -36,7 +36,8 @@ def importing(library: str) -> set[str]:
 def packages_used_by(package: str) -> set[str]:
     """Packages of lidarlearn that a package of it imports."""
     names = {name for path in MODULES if path.relative_to(PACKAGE).parts[0] == package for name in imports_of(path)}
-    return {name.split(".")[1] for name in names if name.startswith("lidarlearn.")} - {package}
+    used = {name.split(".")[1] for name in names if name.startswith("lidarlearn.")} - {package}
+    return {name for name in used if (PACKAGE / name).is_dir()}
 
 
 def test_there_is_something_to_look_at():

@@ -92,8 +92,8 @@ def convergence_basin(
         near_enough = in_range(scan.points, probe.min_range_m, probe.max_range_m)
         sampled = backend.sampling.sample(scan.points[near_enough].to(device))
         if i and i % probe.every == 0:
-            normals = backend.normals(sampled.points, sampled.is_query)
-            queries = sampled.points[sampled.is_query]
+            normals = backend.normals(sampled.points, sampled.queries)
+            queries = sampled.points[sampled.queries]
             successes += _successes(backend, queries, normals, T_true[i], T_error, probe)
             scans += 1
         backend.local_map.update(sampled.points, T_true[i])

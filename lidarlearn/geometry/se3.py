@@ -40,7 +40,9 @@ def orthonormalize(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"
     twice, doubles that drift with every frame: a trajectory must be brought back as it grows.
     """
     U, _, Vh = torch.linalg.svd(T[..., :3, :3])
-    return from_rotation_translation(U @ Vh, T[..., :3, 3])
+    T = T.clone()
+    T[..., :3, :3] = U @ Vh
+    return T
 
 
 def transform(T_target_source: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch n 3"]) -> Tensor:
@@ -111,7 +113,8 @@ def rotation_log(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
 def rotation_angle(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
     """Rotation angle [rad] of a transform, in [0, pi], accurate for tiny angles where acos of the trace is not."""
     R = T[..., :3, :3]
-    return torch.atan2(_twice_sine_axis(R).norm(dim=-1), R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
+    twice_sine = (R - R.mT).flatten(-2).norm(dim=-1) / 2**0.5
+    return torch.atan2(twice_sine, R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
 
 
 def from_euler(parameters: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:

@@ -4,8 +4,10 @@ import functools
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from lidarlearn import cuda_graphs
 
 
 def voxel_cells(points: Float[Tensor, "*batch 3"], voxel_size_m: float) -> Int[Tensor, "*batch 3"]:
@@ -37,12 +39,43 @@ def grid_sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor
 
     Source: Dellenbach et al. 2021, IV-A: 0.4 m for Kd-F2M.
     """
+    if cuda_graphs.are_used_on(points.device):
+        return _grid_sample_on_gpu(points, voxel_size_m)
     lots = _lots(len(points), points.device)
-    keys = voxel_keys(voxel_cells(points, voxel_size_m)).index_select(0, lots)
+    _, order, begins = _sorted(voxel_keys(voxel_cells(points, voxel_size_m)).index_select(0, lots))
+    return lots[order[begins]]
+
+
+_recordings = cuda_graphs.Recordings()
+
+
+def _grid_sample_on_gpu(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor, "m"]:
+    """The same, asking only once for a size."""
+    as_many_as_lots = cuda_graphs.Padding(to_power_of_two=True)
+    sample = functools.partial(_sample, voxel_size_m=voxel_size_m)
+    index, begins = _recordings(sample, points, device=points.device, settings=voxel_size_m, padding=as_many_as_lots)
+    return index[begins]
+
+
+def _sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> tuple[Int[Tensor, "n"], Bool[Tensor, "n"]]:
+    """What `grid_sample` chooses from, and which of it, without asking how far the points reach; NaN is no point.
+
+    Cells are taken to lie within a million of the origin.
+    """
+    lots = _lots(len(points), points.device)
+    x, y, z = ((axis.long() + (1 << 20)) & 0x1FFFFF for axis in voxel_cells(points, voxel_size_m).unbind(-1))
+    nothing = torch.iinfo(torch.int64).max
+    keys = torch.where(points[:, 0].isfinite(), (x << 42) | (y << 21) | z, nothing)
+    keys, order, begins = _sorted(keys.index_select(0, lots))
+    return lots[order], begins & (keys < nothing)
+
+
+def _sorted(keys: Int[Tensor, "n"]) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Bool[Tensor, "n"]]:
+    """The keys in ascending order, where each stood, and whether it is another one than that before it."""
     keys, order = torch.sort(keys, stable=True)
     begins = torch.ones_like(keys, dtype=torch.bool)
     torch.ne(keys[1:], keys[:-1], out=begins[1:])
-    return lots[order[begins]]
+    return keys, order, begins
 
 
 class VoxelSums:
@@ -88,7 +121,7 @@ def _summed(cells: Int[Tensor, "n 3"], values: Float[Tensor, "n c"]) -> tuple[In
 def _lots(n: int, device: torch.device) -> Int[Tensor, "n"]:
     """The numbers from 0 to n - 1 in an order drawn once and for all."""
     lots = _shuffled(max(n - 1, 1).bit_length(), device)
-    return lots.index_select(0, (lots < n).nonzero()[:, 0])
+    return lots if n == len(lots) else lots.index_select(0, (lots < n).nonzero()[:, 0])
 
 
 @functools.cache

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarlearn.geometry import se3
@@ -12,7 +12,8 @@ from lidarlearn.geometry.voxels import voxel_cells
 from lidarlearn.odometry.local_map import LocalMap
 from lidarlearn.odometry.sampling import SampledScan, Sampling
 from lidarlearn.registration.association.aggregated_points import AggregatedPoints
-from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
+from lidarlearn.registration.gauss_newton import GaussNewton
+from lidarlearn.registration.result import RegistrationResult
 
 # Enough to compare hypotheses: the best one is registered again.
 _HYPOTHESIS_ITERATIONS = 20
@@ -69,11 +70,11 @@ class Backend:
     ) -> RegistrationResult:
         points = scan.deskewed(T_previous_new)
         return self.registration.register(
-            points[scan.is_query],
+            points[scan.queries],
             self.local_map.association,
             T_world_previous @ T_previous_new,
             distance_m,
-            self.normals(points, scan.is_query),
+            self.normals(points, scan.queries),
         )
 
     def best_hypothesis(
@@ -83,8 +84,7 @@ class Backend:
 
         The points are not deskewed: the guesses differ by more than the motion within a scan.
         """
-        queries = scan.is_query.nonzero()[:, 0]
-        few = queries[:: max(math.ceil(len(queries) / self.hypothesis_points), 1)]
+        few = scan.queries[:: max(math.ceil(len(scan.queries) / self.hypothesis_points), 1)]
         quick = replace(
             self.registration,
             max_iterations=_HYPOTHESIS_ITERATIONS,
@@ -104,9 +104,9 @@ class Backend:
     def agreement(self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:
         """How well a motion agrees with the map, see `GaussNewton.agreement`."""
         T_world_new = T_world_previous @ T_previous_new
-        return self._agreement(scan.deskewed(T_previous_new), scan.is_query, T_world_new).item()
+        return self._agreement(scan.deskewed(T_previous_new), scan.queries, T_world_new).item()
 
-    def _agreement(self, points: Float[Tensor, "n 3"], chosen: Tensor, T_world_lidar: Tensor) -> Tensor:
+    def _agreement(self, points: Float[Tensor, "n 3"], chosen: Int[Tensor, "m"], T_world_lidar: Tensor) -> Tensor:
         return self.registration.agreement(
             points[chosen],
             self.local_map.association,
@@ -115,7 +115,7 @@ class Backend:
             self.normals(points, chosen),
         )
 
-    def normals(self, points: Float[Tensor, "n 3"], chosen: Tensor) -> Float[Tensor, "m 3"] | None:
+    def normals(self, points: Float[Tensor, "n 3"], chosen: Int[Tensor, "m"]) -> Float[Tensor, "m 3"] | None:
         """Normals of some of a scan's points, from the neighbourhoods among all, where the residual needs them."""
         if not self.registration.residual.needs_normals:
             return None

@@ -46,9 +46,9 @@ class LocalMap:
         self._T_world_key = None
 
     def _is_key_frame(self, T_world_lidar: Float[Tensor, "4 4"]) -> bool:
-        if self._T_world_key is None:
+        if self._T_world_key is None or self._key_frame_distance_m == self._key_frame_angle_deg == 0:
             return True
         moved = motion_difference(self._T_world_key, T_world_lidar)
         is_far = moved.distance_m >= self._key_frame_distance_m > 0
         is_turned = moved.angle_deg >= self._key_frame_angle_deg > 0
-        return is_far or is_turned or self._key_frame_distance_m == self._key_frame_angle_deg == 0
+        return is_far or is_turned

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from lidarlearn.odometry.initialization.base import Initialization, InitialMotio
 from lidarlearn.odometry.judgement import Judgement, motion_difference
 from lidarlearn.odometry.sampling import SampledScan
 from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, as_scan
-from lidarlearn.registration.gauss_newton import RegistrationResult
+from lidarlearn.registration.result import RegistrationResult
 
 _SEARCHED_M = 0.5  # how far off a motion may be that was found among several
 
@@ -66,7 +66,7 @@ class Odometry(ScanByScan):
     @torch.no_grad()
     def register_scan(self, points: Points, times: Times | None = None) -> Frame:
         """Guess the motion, register, judge, try again if in doubt, add the scan to the map."""
-        points, times = self._in_range(*as_scan(points, times))
+        points, times = self._in_range(*as_scan(points, times, self._device))
         guess = self._initialization.predict(points, self._motion)
         scan = self._backend.sampling.sample(points, times)
         if self._backend.local_map.association.is_empty:
@@ -82,8 +82,7 @@ class Odometry(ScanByScan):
 
     def _in_range(self, points: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
         kept = in_range(points, self._min_range_m, self._max_range_m)
-        points = points.index_select(0, kept).to(self._device)
-        return points, None if times is None else times.index_select(0, kept).to(self._device)
+        return points.index_select(0, kept), None if times is None else times.index_select(0, kept)
 
     def _begin(self, scan: SampledScan) -> Health:
         """Start a map with a scan, at the origin or, after a loss, where the motion model puts it."""
@@ -109,50 +108,47 @@ class Odometry(ScanByScan):
 
     def _deskew_first(self, first: SampledScan, scan: SampledScan, T_previous_new: Tensor, source: str) -> None:
         """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the poses."""
-        result = self._register(scan, T_previous_new, source)
-        if self._judgement.accepts(result):
+        attempt = self._register(scan, T_previous_new, source)
+        if self._judgement.accepts(attempt.result):
             self._backend.local_map.restart()
-            self._backend.local_map.update(first.deskewed(self._motion_to(result)), self._T_world_lidar)
+            self._backend.local_map.update(first.deskewed(attempt.motion), self._T_world_lidar)
 
     def _advance(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> Health:
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
-        result = self._register(scan, T_previous_new, source)
-        health = self._assess(scan, result, source)
-        if self._recovery and source != "start" and self._is_doubtful(result, health):
-            result, health = self._try_others(scan, T_previous_new, result, health)
-        if not self._judgement.accepts(result):
-            return self._coast(health)
-        self._fits.append(result.fit.item())
-        motion = self._motion_to(result)
-        self._surprises_m.append(_displacement_m(scan, T_previous_new, motion))
-        self._trust(motion, health)
+        attempt = self._register(scan, T_previous_new, source)
+        if self._recovery and source != "start" and self._is_doubtful(attempt):
+            attempt = self._try_others(scan, T_previous_new, attempt)
+        if not self._judgement.accepts(attempt.result):
+            return self._coast(attempt.health)
+        self._fits.append(attempt.result.fit.item())
+        self._surprises_m.append(_displacement_m(scan, T_previous_new, attempt.motion))
+        self._trust(attempt.motion, attempt.health)
         self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
         self._first = None
         self._coasting = 0
-        return health
+        return attempt.health
 
-    def _try_others(
-        self, scan: SampledScan, T_guess: Tensor, result: RegistrationResult, health: Health
-    ) -> tuple[RegistrationResult, Health]:
+    def _try_others(self, scan: SampledScan, T_guess: Tensor, attempt: "_Attempt") -> "_Attempt":
         """The better of a doubtful registration and the best from other motions; one that leaps, clearly the better."""
         other = self._register(scan, self._search(scan, surprise_motions(T_guess, self._motion)), "recovery")
-        other_health = self._assess(scan, other, "recovery")
-        needed = self._judgement.min_gain * (other_health.implausible - health.implausible)
-        if self._agreement(scan, other) - self._agreement(scan, result) > needed:
-            result, health = other, other_health
-        return result, replace(health, status="recovered")
+        needed = self._judgement.min_gain * (other.health.implausible - attempt.health.implausible)
+        if self._agreement(scan, other) - self._agreement(scan, attempt) > needed:
+            attempt = other
+        return replace(attempt, health=replace(attempt.health, status="recovered"))
 
-    def _is_doubtful(self, result: RegistrationResult, health: Health) -> bool:
-        fits_as_before = result.fit.item() >= self._judgement.min_fit_share * max(self._fits, default=0.0)
-        return health.implausible or not fits_as_before or not self._judgement.accepts(result)
+    def _is_doubtful(self, attempt: "_Attempt") -> bool:
+        fits_as_before = attempt.result.fit.item() >= self._judgement.min_fit_share * max(self._fits, default=0.0)
+        return attempt.health.implausible or not fits_as_before or not self._judgement.accepts(attempt.result)
 
-    def _register(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> RegistrationResult:
+    def _register(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> "_Attempt":
         is_searched = source in ("start", "recovery")
         surprise_m = _SEARCHED_M if is_searched else max(self._surprises_m, default=math.inf)
-        return self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m)
+        result = self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m)
+        motion = se3.orthonormalize(torch.linalg.solve(self._T_world_lidar, result.T_world_lidar))
+        return _Attempt(result, motion, self._assess(scan, result, motion, source))
 
-    def _agreement(self, scan: SampledScan, result: RegistrationResult) -> float:
-        return self._backend.agreement(scan, self._motion_to(result), self._T_world_lidar)
+    def _agreement(self, scan: SampledScan, attempt: "_Attempt") -> float:
+        return self._backend.agreement(scan, attempt.motion, self._T_world_lidar)
 
     def _search(self, scan: SampledScan, T_previous_new: Float[Tensor, "h 4 4"]) -> Tensor:
         return self._backend.best_hypothesis(scan, T_previous_new, self._T_world_lidar)
@@ -178,13 +174,13 @@ class Odometry(ScanByScan):
     def _move(self, motion: Tensor) -> None:
         self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ motion)
 
-    def _assess(self, scan: SampledScan, result: RegistrationResult, source: str) -> Health:
-        deviation = motion_difference(self._motion, self._motion_to(result))
+    def _assess(self, scan: SampledScan, result: RegistrationResult, motion: Tensor, source: str) -> Health:
+        deviation = motion_difference(self._motion, motion)
         information = result.information[0].item()
         return Health(
             frame=self._frames,
             initialization=source,
-            points=int(scan.is_query.sum()),
+            points=len(scan.queries),
             iterations=result.iterations,
             converged=bool(result.converged),
             overlap=result.overlap.item(),
@@ -199,16 +195,22 @@ class Odometry(ScanByScan):
         )
 
     def _unregistered(self, scan: SampledScan, source: str) -> Health:
-        return Health(self._frames, initialization=source, points=int(scan.is_query.sum()))
+        return Health(self._frames, initialization=source, points=len(scan.queries))
 
     def _has_enough_points(self, scan: SampledScan) -> bool:
-        return int(scan.is_query.sum()) >= self._judgement.min_points
+        return len(scan.queries) >= self._judgement.min_points
 
-    def _motion_to(self, result: RegistrationResult) -> Tensor:
-        return se3.orthonormalize(se3.inverse(self._T_world_lidar) @ result.T_world_lidar)
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A registration, the motion that it means, and what is to be thought of it."""
+
+    result: RegistrationResult
+    motion: Float[Tensor, "4 4"]
+    health: Health
 
 
 def _displacement_m(scan: SampledScan, T_guess: Tensor, T_previous_new: Tensor) -> float:
     """How far a point at the mean range was from where the guess had it."""
     surprise = motion_difference(T_guess, T_previous_new)
-    return surprise.distance_m + math.radians(surprise.angle_deg) * scan.points.norm(dim=1).mean().item()
+    return surprise.distance_m + math.radians(surprise.angle_deg) * scan.mean_range_m

@@ -1,19 +1,22 @@
 """Which points of a scan go into the map, and which of those are registered."""
 
+import functools
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarlearn.cuda_graphs import Padding, Recordings
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import grid_sample
 from lidarlearn.odometry.deskew import deskew
 
 _DENSE_MAP_VOXEL_M, _PAPER_QUERY_VOXEL_M = 0.4, 1.0
 _NARROWEST_SEARCH_M = 0.5
+_PADDING = Padding()
 _DENSE_RANGE_M = 35.0  # up to here neighbouring beams are no farther apart than a voxel
 
 
@@ -59,12 +62,17 @@ class SampledScan:
     Args:
         points: points for the map [m].
         times: share of the scan period of each, see `lidarlearn.data.sequence.Scan`.
-        is_query: whether a point is also registered.
+        queries: indices, ascending, of the points that are also registered.
     """
 
     points: Float[Tensor, "n 3"]
     times: Float[Tensor, "n"] | None
-    is_query: Bool[Tensor, "n"]
+    queries: Int[Tensor, "m"]
+
+    @functools.cached_property
+    def mean_range_m(self) -> float:
+        """Mean distance of the points from the sensor [m]."""
+        return self.points.norm(dim=1).mean().item()
 
     def deskewed(self, T_previous_new: Float[Tensor, "4 4"]) -> Float[Tensor, "n 3"]:
         """All points, compensated for the motion over one scan period."""
@@ -102,11 +110,11 @@ class GridSampling(Sampling):
         """One point of every voxel, drawn by `grid_sample`, in the order of the voxels."""
         index = grid_sample(points, self.map_voxel_m)
         points = points[index]
-        is_query = torch.ones(len(points), dtype=torch.bool, device=points.device)
         if self.query_voxel_m is not None and self.query_voxel_m > self.map_voxel_m:
-            is_query[:] = False
-            is_query[grid_sample(points, self.query_voxel_m)] = True
-        return SampledScan(points, None if times is None else times[index], is_query)
+            queries = grid_sample(points, self.query_voxel_m).sort().values
+        else:
+            queries = torch.arange(len(points), device=points.device)
+        return SampledScan(points, None if times is None else times[index], queries)
 
 
 @dataclass(frozen=True)
@@ -122,13 +130,13 @@ class ImageSampling(Sampling):
 
     projection: SphericalProjection
     max_queries: int = 8000
+    _recordings: Recordings = field(default_factory=Recordings, init=False, repr=False, compare=False)
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
         """The nearest points, and an evenly strided subset of them, scattered over rows and columns."""
-        index = self.projection.nearest_points(points).flatten()
+        nearest_points = self.projection.nearest_points
+        index = self._recordings(nearest_points, points, device=points.device, padding=_PADDING).flatten()
         index = index[index >= 0]
         count = min(self.max_queries, len(index))
         chosen = torch.linspace(0, max(len(index) - 1, 0), count, dtype=torch.float64, device=points.device)
-        is_query = torch.zeros(len(index), dtype=torch.bool, device=points.device)
-        is_query[chosen.round().long()] = True
-        return SampledScan(points[index], None if times is None else times[index], is_query)
+        return SampledScan(points[index], None if times is None else times[index], chosen.round_().long())

@@ -1,52 +1,24 @@
 """Gauss-Newton registration of a scan against a searchable map."""
 
+import functools
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.registration.association.base import Association, Neighbours
-from lidarlearn.registration.normal_equations import NormalEquations, position_of
+from lidarlearn.registration.association.base import Association
+from lidarlearn.registration.matching import Matching, Queries
+from lidarlearn.registration.normal_equations import NormalEquations, Position, Terms, position_of
 from lidarlearn.registration.residuals import PointToPlane, Residual
+from lidarlearn.registration.result import RegistrationResult
+from lidarlearn.registration.steps import lengths, motion
 from lidarlearn.registration.weights import GemanMcClure, RobustWeight
 
 _FEW = 0.1  # share of the points below which neighbours are too few for what they say to be believed
-
-
-@dataclass(frozen=True)
-class RegistrationResult:
-    """Where a scan fits, and how well: enough to judge an alignment instead of trusting it.
-
-    Tensors share the batch shape of the initial poses, and are on the CPU as poses are.
-
-    Args:
-        T_world_lidar: the registered poses, float64.
-        iterations: Gauss-Newton steps taken, those of the slowest of a batch.
-        converged: whether the last step was below the tolerances, at the final search distance.
-        overlap: share of the points that have a map neighbour with a normal within the search distance.
-        inlier_share: share of those whose distance d from the map's surface is below `inlier_residual_m`.
-        fit: mean over all points of exp(-(d / fit_residual_m)^2), 0 for those without a neighbour: sharper than the
-            inlier share, it tells the right pose from its neighbours.
-        rmse_m: weighted root mean square of the residuals [m].
-        hessian: of the weighted half squares by (translation [m], rotation [rad]) in the sensor's frame.
-        information: weighted share of all points that notice a move along each of the three axes of the position's
-            covariance, ascending: 0 along a corridor, where no residual changes however the pose follows.
-        weakest_direction: unit vector, in the sensor's frame, of the smallest of them.
-    """
-
-    T_world_lidar: Float[Tensor, "*batch 4 4"]
-    iterations: int
-    converged: Bool[Tensor, "*batch"]
-    overlap: Float[Tensor, "*batch"]
-    inlier_share: Float[Tensor, "*batch"]
-    fit: Float[Tensor, "*batch"]
-    rmse_m: Float[Tensor, "*batch"]
-    hessian: Float[Tensor, "*batch 6 6"]
-    information: Float[Tensor, "*batch 3"]
-    weakest_direction: Float[Tensor, "*batch 3"]
 
 
 @dataclass(frozen=True)
@@ -99,13 +71,12 @@ class GaussNewton:
             )
 
     @property
-    def _tolerances(self) -> Float[Tensor, "2"]:
-        tolerances = [self.translation_tolerance_m, math.radians(self.rotation_tolerance_deg)]
-        return torch.tensor(tolerances, dtype=torch.float64)
+    def _tolerances(self) -> tuple[float, float]:
+        return self.translation_tolerance_m, math.radians(self.rotation_tolerance_deg)
 
     @property
-    def _longest(self) -> Float[Tensor, "2"]:
-        return torch.tensor([self.max_step_m, math.radians(self.max_step_deg)], dtype=torch.float64)
+    def _longest(self) -> tuple[float, float]:
+        return self.max_step_m, math.radians(self.max_step_deg)
 
     def register(
         self,
@@ -127,27 +98,30 @@ class GaussNewton:
         Returns:
             The result; with nothing to hold on to, the initial pose, not converged, with an overlap of 0.
         """
-        T = T_world_lidar.cpu()
-        converged = torch.zeros(T.shape[:-2], dtype=torch.bool)
-        distance, iterations, found = search_distance_m, 0, None
+        T = T_world_lidar.cpu().numpy()
+        converged = np.zeros(T.shape[:-2], dtype=bool)
+        matching, queries = self._matching(association), Queries(points, normals)
+        # Where functions are recorded, another number of points would take another recording, and no less time.
+        is_recorded = matching.recordings(queries) is not None
+        coarse = queries if is_recorded else queries.every(self.coarse_stride)
+        distance_m, iterations, found = search_distance_m, 0, None
         while not iterations or (iterations < self.max_iterations and not converged.all()):
             iterations += 1
-            final = distance <= self.search_distance_m
-            stride = 1 if final else self.coarse_stride
-            used_normals = None if normals is None else normals[::stride]
-            distance = max(distance, self.search_distance_m)
-            equations = self._linearize(points[::stride], association, T, distance, used_normals, found)
-            found = equations.found
-            step = torch.where(converged[..., None], 0.0, self._solve(equations))
-            T = T @ se3.exp(step)
+            final = distance_m <= self.search_distance_m
+            distance_m = max(distance_m, self.search_distance_m)
+            equations = matching.equations(queries if final else coarse, T, distance_m, found)
+            found = equations.terms.found
+            position = position_of(equations)
+            step = np.where(converged[..., None], 0.0, self._step(equations, position))
+            T = T @ motion(step)
             if final:
-                is_small = (_lengths(step) < self._tolerances).all(-1)
-                converged = converged | (is_small & (equations.H != 0).flatten(-2).any(-1))
-            distance *= self.narrowing
-        T = se3.orthonormalize(T)
+                is_small = (lengths(step) < self._tolerances).all(-1)
+                converged = np.asarray(converged | (is_small & (equations.H != 0).any((-2, -1))))
+            distance_m *= self.narrowing
         if not converged.all():  # else the last equations describe all of them, but for a small step
-            equations = self._linearize(points, association, T, self.search_distance_m, normals, found)
-        return self._judge(T, iterations, converged, equations)
+            equations = matching.equations(queries, T, self.search_distance_m, found)
+            position = position_of(equations)
+        return self._judge(T, iterations, converged, equations, position)
 
     def agreement(
         self,
@@ -169,88 +143,57 @@ class GaussNewton:
             search_distance_m: what is farther from the map says nothing [m]: wide enough to see what does not fit.
             normals: as in `register`.
         """
-        equations = self._linearize(points, association, T_world_lidar, search_distance_m, normals)
-        fit, neighbours = self._fits(equations).sum(-1), equations.mask.sum(-1)
+        matching, T = self._matching(association), T_world_lidar.cpu().numpy()
+        terms = matching.equations(Queries(points, normals), T, search_distance_m).terms
+        fit, neighbours = self._fits(terms).sum(-1), terms.mask.sum(-1)
         return (fit / (neighbours + _FEW * max(len(points), 1))).cpu()
 
-    def _linearize(
-        self,
-        points: Tensor,
-        association: Association,
-        T: Tensor,
-        distance_m: float,
-        normals: Tensor | None,
-        last: Neighbours | None = None,
-    ) -> NormalEquations:
-        T = T.to(points)
-        points_world = se3.transform(T, points)
-        found = association.search(points_world.reshape(-1, 3), distance_m, last)
-        map_points = found.points.view_as(points_world)
-        map_normals = found.normals.view_as(points_world)
-        mask = (found.mask & (found.normals != 0).any(dim=-1)).view(points_world.shape[:-1])
-        linear = self.residual.linearize(T, points, points_world, map_points, map_normals, normals)
-        offsets = points_world - map_points
-        is_distance = linear.residuals.shape[-1] == 1
-        size = linear.residuals[..., 0].abs() if is_distance else linear.residuals.norm(dim=-1)
-        widening = distance_m / self.search_distance_m  # a narrow kernel would hold on to whatever is near by chance
-        squared_distances = offsets.square().sum(-1)
-        weights = self.weight.weight(size / widening, squared_distances / widening**2) * mask
-        # Summed in single precision, H would no longer tell "nothing is known" from its own rounding.
-        rows = linear.rows.double()
-        sums = ((rows * weights[..., None, None]).flatten(-3, -2).mT @ rows.flatten(-3, -2)).cpu()
-        return NormalEquations(
-            H=sums[..., :6, :6],
-            g=sums[..., :6, 6],
-            squares=sums[..., 6, 6],
-            found=found.neighbours,
-            mask=mask,
-            # Whatever is minimized, a pose is judged by how far points are off the map's surface, not along it.
-            off_m=size if is_distance else (offsets * map_normals).sum(-1).abs(),
-            weights=weights,
-            jacobians=linear.jacobians,
-        )
+    def _matching(self, association: Association) -> Matching:
+        return Matching(self.residual, self.weight, self.search_distance_m, association)
 
-    def _solve(self, equations: NormalEquations) -> Float[Tensor, "*batch 6"]:
+    def _step(self, equations: NormalEquations, position: Position) -> Float64[np.ndarray, "*batch 6"]:
         """The minimum of the linearized energy, on condition that the position stays where nothing is known of it."""
-        position = position_of(equations)
         step = -(position.covariance @ equations.g[..., None])
         unknown = (position.information < self.min_information)[..., None]
-        along = position.directions.mT @ step[..., :3, :]
-        step = step - position.responses @ (unknown * along)
-        step = step[..., 0]
-        excess = _lengths(step) / self._longest
-        return step / excess.amax(dim=-1, keepdim=True).clamp(min=1)
+        along = position.directions.swapaxes(-1, -2) @ step[..., :3, :]
+        step = (step - position.responses @ (unknown * along))[..., 0]
+        excess = lengths(step) / self._longest
+        return step / np.maximum(excess.max(-1, keepdims=True), 1.0)
 
-    def _judge(self, T: Tensor, iterations: int, converged: Tensor, equations: NormalEquations) -> RegistrationResult:
-        position = position_of(equations)
-        order = position.information.argsort(dim=-1)
-        neighbour = equations.mask.double()
-        sums = [
-            neighbour,
-            neighbour * (equations.off_m < self.inlier_residual_m),
-            self._fits(equations),
-            equations.weights,
-        ]
-        neighbours, inliers, fit, weight = torch.stack(sums).sum(-1).cpu()
-        points = max(equations.mask.shape[-1], 1)
+    def _judge(
+        self,
+        T: Float64[np.ndarray, "*batch 4 4"],
+        iterations: int,
+        converged: Bool[np.ndarray, "*batch"],
+        equations: NormalEquations,
+        position: Position,
+    ) -> RegistrationResult:
+        terms = equations.terms
+        count = functools.partial(self._counts, terms)
+        counts = terms.recordings(count, device=terms.mask.device, settings=self, reads_first=True)
+        neighbours, inliers, fit, weight = counts.numpy()
+        points = max(equations.points, 1)
+        order = position.information.argsort(axis=-1)
+        weakest = np.take_along_axis(position.directions, order[..., None, :], axis=-1)[..., 0]
         return RegistrationResult(
-            T_world_lidar=T,
+            T_world_lidar=se3.orthonormalize(torch.from_numpy(T)),
             iterations=iterations,
-            converged=converged,
-            overlap=neighbours / points,
-            inlier_share=inliers / neighbours.clamp(min=1),
-            fit=fit / points,
-            rmse_m=(equations.squares / weight.clamp(min=1e-12)).sqrt(),
-            hessian=equations.H,
-            information=position.information.gather(-1, order),
-            weakest_direction=position.directions.take_along_dim(order[..., None, :], dim=-1)[..., 0],
+            converged=torch.as_tensor(converged),
+            overlap=torch.as_tensor(neighbours / points),
+            inlier_share=torch.as_tensor(inliers / np.maximum(neighbours, 1)),
+            fit=torch.as_tensor(fit / points),
+            rmse_m=torch.as_tensor(np.sqrt(equations.squares / np.maximum(weight, 1e-12))),
+            hessian=torch.from_numpy(equations.H),
+            information=torch.from_numpy(np.take_along_axis(position.information, order, axis=-1)),
+            weakest_direction=torch.from_numpy(weakest),
         )
 
-    def _fits(self, equations: NormalEquations) -> Float[Tensor, "*batch m"]:
+    def _counts(self, terms: Terms) -> Float[Tensor, "4 *batch"]:
+        """Number of points with a neighbour, of those that fit, how well all fit, and the weights; summed up."""
+        neighbour = terms.mask.double()
+        inlier = neighbour * (terms.off_m < self.inlier_residual_m)
+        return torch.stack([neighbour, inlier, self._fits(terms), terms.weights]).sum(-1)
+
+    def _fits(self, terms: Terms) -> Float[Tensor, "*batch m"]:
         """How well each point fits the map's surface, 0..1, 0 without a neighbour."""
-        return equations.mask * torch.exp(-((equations.off_m / self.fit_residual_m) ** 2))
-
-
-def _lengths(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 2"]:
-    """Translation [m] and angle [rad] of small motions."""
-    return xi.unflatten(-1, (2, 3)).norm(dim=-1)
+        return terms.mask * torch.exp(-((terms.off_m / self.fit_residual_m) ** 2))

@@ -1,12 +1,13 @@
 """A trained network out of its checkpoint, without the machinery that trained it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidarlearn.cuda_graphs import Recordings
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.training.checkpoints import CheckpointError, load_checkpoint
@@ -28,12 +29,18 @@ class TrainedNetwork:
     network: nn.Module
     projection: SphericalProjection
     device: torch.device
+    _recordings: Recordings = field(default_factory=Recordings, init=False, repr=False, compare=False)
 
     @torch.no_grad()
     def relative_pose(
         self, reference: Float[Tensor, "batch 3 h w"], target: Float[Tensor, "batch 3 h w"]
     ) -> Float[Tensor, "batch 4 4"]:
         """`T_ref_new`, float64, from two vertex maps [m] made with `projection`."""
+        if len(reference) > 1:  # enough for a GPU to do while it is asked for more
+            return self._relative_pose(reference, target)
+        return self._recordings(self._relative_pose, reference, target, device=self.device).clone()
+
+    def _relative_pose(self, reference: Tensor, target: Tensor) -> Float[Tensor, "batch 4 4"]:
         return se3.from_euler(self.network(reference, target).double())
 
 

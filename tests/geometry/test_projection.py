@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from lidarlearn.geometry.projection import SphericalProjection, activated, points_of
+from tests.gpu import on_gpu
 
 HDL64 = SphericalProjection()
 SMALL = SphericalProjection(height=6, width=10, fov_up_deg=30.0, fov_down_deg=-30.0)
@@ -138,3 +139,12 @@ def test_gradcheck_through_the_vertex_map():
 def test_impossible_images_are_refused(settings):
     with pytest.raises(ValueError, match="height, width >= 1 and fov_up_deg > fov_down_deg"):
         SphericalProjection(*settings)
+
+
+@on_gpu
+def test_a_gpu_finds_the_same_nearest_points():
+    """But for points on the border of a pixel, which may round to either side."""
+    points = random_points(100_000, scale=30.0)
+    here, there = HDL64.nearest_points(points), HDL64.nearest_points(points.cuda()).cpu()
+    assert (here == there).float().mean() > 0.999
+    assert torch.equal(there, HDL64.nearest_points(points.cuda()).cpu())

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from lidarlearn.geometry.voxels import VoxelSums, grid_sample, voxel_cells, voxel_keys
+from tests.gpu import on_gpu
 
 
 def random_points(n: int, scale: float) -> torch.Tensor:
@@ -80,3 +81,11 @@ def test_the_memory_of_sums_goes_by_the_voxels(monkeypatch):
 def test_sums_over_nothing_are_empty():
     cells, sums = VoxelSums(2).result()
     assert cells.shape == (0, 3) and sums.shape == (0, 2)
+
+
+@on_gpu
+def test_a_gpu_samples_the_same_points():
+    """The first time by calling, the second by recording, then by replaying."""
+    for seed in range(4):
+        points = 50 * torch.rand(3000 + seed, 3, generator=torch.Generator().manual_seed(seed)) - 25
+        assert torch.equal(grid_sample(points.cuda(), 0.8).cpu(), grid_sample(points, 0.8))

@@ -15,6 +15,7 @@ from lidarlearn.registration.association import KdTree
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl64
+from tests.gpu import on_gpu
 from tests.odometry.odometries import (
     ASSOCIATIONS,
     FRAMES,
@@ -192,11 +193,11 @@ def test_scans_may_be_arrays_of_any_number_type():
         assert torch.equal(poses(as_float32), poses(as_arrays))
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@kd_at_least
-def test_cuda_gives_the_poses_of_the_cpu(association):
-    on_cpu = poses(run(build(f"cv+{association}_f2m"), scans()[:8]))
-    on_gpu = poses(run(build(f"cv+{association}_f2m", "device=cuda"), scans()[:8]))
-    translations, angles = motion_errors(on_gpu, on_cpu)
+@on_gpu
+@pytest.mark.parametrize("association", ASSOCIATIONS)
+@pytest.mark.parametrize("map_", ["f2f", "f2m"])
+def test_cuda_gives_the_poses_of_the_cpu(association, map_):
+    here = poses(run(build(f"cv+{association}_{map_}"), scans()))
+    there = poses(run(build(f"cv+{association}_{map_}", "device=cuda"), scans()))
+    translations, angles = motion_errors(there, here)
     assert translations.max() < 2e-3 and angles.max() < 0.02

@@ -26,7 +26,7 @@ def rows(points: torch.Tensor) -> set[tuple[float, ...]]:
 
 
 def queries(sampled: SampledScan) -> torch.Tensor:
-    return sampled.points[sampled.is_query]
+    return sampled.points[sampled.queries]
 
 
 @pytest.mark.parametrize(("query_voxel_m", "edge_m"), [(None, 0.4), (0.4, 0.4), (0.6, 0.6)])
@@ -60,8 +60,8 @@ def test_beams_far_apart_share_wider_voxels_and_every_point_of_the_map_is_regist
 @pytest.mark.parametrize("sampling", [GridSampling(), ImageSampling(IMAGE), ImageSampling(IMAGE, max_queries=100)])
 def test_queries_are_distinct_points_of_the_map(points, sampling):
     sampled = sampling.sample(points)
-    assert len(rows(queries(sampled))) == sampled.is_query.sum() > 0
-    assert len(sampled.is_query) == len(sampled.points)
+    assert len(rows(queries(sampled))) == len(sampled.queries) > 0
+    assert (sampled.queries.diff() > 0).all() and sampled.queries[-1] < len(sampled.points)
 
 
 def test_the_image_holds_the_nearest_point_of_each_pixel(points):
@@ -72,7 +72,7 @@ def test_the_image_holds_the_nearest_point_of_each_pixel(points):
 
 def test_queries_are_as_many_as_asked_for_and_spread_over_the_image(points):
     sampled = ImageSampling(IMAGE, max_queries=2000).sample(points)
-    assert sampled.is_query.sum() == 2000
+    assert len(sampled.queries) == 2000
     pixel = IMAGE.pixel_index(queries(sampled))
     all_pixels = IMAGE.pixel_index(sampled.points)
     for part, parts in ((lambda p: p // 720, 64), (lambda p: p % 720 // 45, 16)):
@@ -85,4 +85,4 @@ def test_queries_are_as_many_as_asked_for_and_spread_over_the_image(points):
 @pytest.mark.parametrize("count", [0, 1])
 def test_tiny_scans_are_sampled(sampling, count):
     sampled = sampling.sample(torch.tensor([[10.0, 2.0, -1.0]]).expand(count, 3))
-    assert len(sampled.points) == sampled.is_query.sum() == count
+    assert len(sampled.points) == len(sampled.queries) == count

@@ -50,8 +50,8 @@ def scene(name: str, association: str) -> Scene:
         points = way.scan(i).points
         searchable.insert(sampling.sample(points).points, way.T_world_lidar[i], 30)
     sampled = sampling.sample(way.scan(_MAP_SCANS).points)
-    normals = neighbourhood_normals(sampled.points, 0.4)[sampled.is_query]
-    queries = sampled.points[sampled.is_query]
+    normals = neighbourhood_normals(sampled.points, 0.4)[sampled.queries]
+    queries = sampled.points[sampled.queries]
     stride = 4 if association == "p" else 1
     return Scene(searchable, queries[::stride], normals[::stride], way.T_world_lidar[_MAP_SCANS])
 

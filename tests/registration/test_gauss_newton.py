@@ -6,8 +6,9 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.registration.association.base import Association, Correspondences, Neighbours
-from lidarlearn.registration.gauss_newton import GaussNewton, RegistrationResult
+from lidarlearn.registration.gauss_newton import GaussNewton
 from lidarlearn.registration.residuals import GeneralizedIcp, PointToPlane, PointToPoint
+from lidarlearn.registration.result import RegistrationResult
 from lidarlearn.registration.weights import Cauchy, CutOff, GemanMcClure, Huber, NoWeight, Proximity
 from tests.registration import maps
 

@@ -15,7 +15,7 @@ def test_the_last_scans_stand_behind_each_other_however_often_the_buffers_are_fu
         assert torch.equal(window.coordinates, torch.cat(scans, dim=1))
         assert torch.equal(window.normals, -torch.cat(scans, dim=1).mT)
         expected = [i for i, scan in enumerate(scans) for _ in range(scan.shape[1])]
-        assert window.last(len(window))[1].tolist() == expected
+        assert window.scans.tolist() == expected
 
 
 def test_fewer_scans_can_be_kept_later_on():
@@ -24,4 +24,4 @@ def test_fewer_scans_can_be_kept_later_on():
         window.forget(scans - 1)
         window.push(torch.ones(3, 4) * scans, torch.zeros(4, 3))
     assert len(window) == 1 and torch.equal(window.coordinates, torch.ones(3, 4))
-    assert window.last(len(window))[1].tolist() == [0] * 4
+    assert window.scans.tolist() == [0] * 4

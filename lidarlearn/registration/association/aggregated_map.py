@@ -1,7 +1,7 @@
 """Maps that aggregate the last scans, one point per voxel."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarlearn.geometry import se3
@@ -31,6 +31,14 @@ class AggregatedMap(Association):
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
         """Add a registered scan."""
         self._map.insert(se3.transform(T_world_lidar, points), frames)
+
+    def points_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+        """Some of `points`, by their index."""
+        return self._map.points_at(index)
+
+    def normals_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+        """Some of `normals`, by their index."""
+        return self._map.normals_at(index)
 
     @property
     def points(self) -> Float[Tensor, "m 3"]:

@@ -4,11 +4,16 @@ A table maps voxels to points: a point lives for k scans, an occupied voxel take
 """
 
 import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarlearn import cuda_graphs
 from lidarlearn.geometry.normals import fit_planes
 from lidarlearn.geometry.voxels import grid_sample, voxel_cells
 from lidarlearn.registration.association.sliding_window import SlidingWindow
@@ -17,6 +22,7 @@ from lidarlearn.registration.association.sliding_window import SlidingWindow
 # 0.4 m, so neighbours never collide and stand side by side in memory. Of two points that share one, 7 of 97,000 on a
 # motorway, the later is found.
 _TABLE_BITS = (9, 9, 6)
+_PADDING = cuda_graphs.Padding(least=1 << 12)  # with points that are none
 _MIN_NEIGHBOURS = 5
 _MAX_ROUGHNESS = 0.5  # deviation from the plane over the smaller extent in it
 _MIN_EXTENT = 0.15  # smaller extent in the plane over the voxel size: a line of points, as of one beam, has no normal
@@ -39,26 +45,32 @@ class AggregatedPoints(SlidingWindow):
     def __init__(self, voxel_size_m: float, device: torch.device) -> None:
         self.voxel_size_m = voxel_size_m
         super().__init__(device)
-        self._table = torch.full((1 << sum(_TABLE_BITS),), -1, dtype=torch.int32, device=device)
+        # One more, for what is no point.
+        self._table = torch.full(((1 << sum(_TABLE_BITS)) + 1,), -1, dtype=torch.int32, device=device)
 
     def insert(self, points_world: Float[Tensor, "n 3"], frames: int) -> None:
         """Add the points that fall into free voxels as one scan; keep the last `frames` scans."""
         self.forget(frames - 1)
-        free = self.lookup(voxel_cells(points_world, self.voxel_size_m)) < 0
-        points_world = points_world[free]
+        is_free = self._recorded(self._is_free, points_world)
+        points_world = points_world[is_free[: len(points_world)]]
         points_world = points_world[grid_sample(points_world, self.voxel_size_m)]
-        cells = voxel_cells(points_world, self.voxel_size_m)
-        new = self._append(points_world.mT)
-        self._cells[new] = cells
-        self._table[_slots(cells)] = torch.arange(new.start, new.stop, dtype=torch.int32, device=self._device)
-        self._update_moments(new)
+        count = len(points_world)
+        padding = _PADDING.length(count) - count if cuda_graphs.are_used_on(self._device) else 0
+        new, _ = self._claim(count, spare=padding)
+        self._recorded(self._add, points_world, torch.tensor(new.start))
+
+    def _recorded(self, function: Callable[..., Any], *inputs: Tensor) -> Any:
+        return self.recordings(function, *inputs, device=self._device, settings=function.__name__, padding=_PADDING)
+
+    def _is_free(self, points_world: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        return self.lookup(voxel_cells(points_world, self.voxel_size_m)) < 0
 
     def lookup(self, cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
         """Index into `points` of the point in each voxel, -1 where there is none."""
-        index = self._table[_slots(cells)].long()
-        alive = index >= self._start
+        index = self._table[_slots(cells)]
+        alive = index >= self.origin
         same = (self._cells[index.clamp(min=0)] == cells).all(dim=-1)
-        return torch.where(alive & same, index - self._start, -1)
+        return torch.where(alive & same, index - self.origin, -1).long()
 
     def around(self, points_world: Float[Tensor, "m 3"], radius: int, inner: int = -1) -> Int[Tensor, "m c"]:
         """Candidates for the neighbours of each point: what stands in the voxels up to so many steps from its own.
@@ -69,44 +81,77 @@ class AggregatedPoints(SlidingWindow):
             inner: voxels up to this number of steps away are left out.
 
         Returns:
-            Indices into `points`. An empty voxel, or one whose slot another voxel took, gives a point from anywhere:
+            Places in `buffer`. An empty voxel, or one whose slot another voxel took, gives a point from anywhere:
             distances tell them apart, which is cheaper than to compare voxels.
         """
         cells = voxel_cells(points_world, self.voxel_size_m)
-        return self._candidates(cells, radius, inner).clamp(min=self._start) - self._start
+        return self._candidates(cells, radius, inner).clamp_(min=self.origin)
+
+    def reached(self, points_world: Float[Tensor, "m 3"], reach_m: float) -> Int[Tensor, "m c"]:
+        """The same in all voxels that are not farther than a distance from each point, and hardly any more."""
+        first = voxel_cells(points_world - reach_m, self.voxel_size_m)
+        steps = torch.arange(voxels_reached(reach_m, self.voxel_size_m), dtype=torch.int32, device=self._device)
+        return self._table_at(first, steps).clamp_(min=self.origin)
 
     def _candidates(self, cells: Int[Tensor, "m 3"], radius: int, inner: int = -1) -> Int[Tensor, "m c"]:
         """What the table says of the voxels in a cube around each voxel, as `_cube` lists them."""
-        cells, steps = cells.int(), torch.arange(-radius, radius + 1, dtype=torch.int32, device=self._device)
+        steps = torch.arange(-radius, radius + 1, dtype=torch.int32, device=self._device)
+        used = _cube(radius, self._device).abs().amax(dim=1) > inner if inner >= 0 else None
+        return self._table_at(cells, steps, used)
+
+    def _table_at(
+        self, cells: Int[Tensor, "m 3"], steps: Int[Tensor, "k"], used: Bool[Tensor, "cube"] | None = None
+    ) -> Int[Tensor, "m c"]:
+        """What the table says of the voxels so many steps from each voxel along all axes, z fastest."""
         x, y, z = (_axis_slots(cells[:, axis, None] + steps, axis) for axis in range(3))
         slots = (x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]).flatten(1)
-        if inner >= 0:
-            slots = slots[:, _cube(radius, self._device).abs().amax(dim=1) > inner]
+        if used is not None:
+            slots = slots[:, used]
         return self._table.index_select(0, slots.flatten()).view_as(slots)
 
-    def _update_moments(self, new: slice) -> None:
-        """Let the new points and their neighbours count each other, and refit the planes that changed."""
-        cells = self._cells[new]
-        index = self._candidates(cells, 1)
-        row, column = (index >= self._start).nonzero(as_tuple=True)
-        index = index[row, column].long()
-        offsets = self._cells[index] - cells[row]
-        near = (offsets.abs().amax(dim=1) <= 1) & (offsets != 0).any(dim=1)  # a slot may be another voxel's
-        row, index = row[near], index[near]
-        x, y, z = self._coordinates[:, index] - self._coordinates[:, new][:, row]
-        ones = torch.ones_like(x)
+    def _add(self, points_world: Float[Tensor, "m 3"], first: Int[Tensor, ""]) -> None:
+        """Write points to their places, from the first on, and let them and their neighbours count each other.
+
+        A point that is NaN is none: it is written behind the others, where nothing is yet.
+        """
+        new = first + torch.arange(len(points_world), device=self._device)
+        cells = voxel_cells(points_world, self.voxel_size_m)
+        self.buffer.index_copy_(1, new, points_world.mT)
+        self._cells.index_copy_(0, new, cells)
+        self._moments.index_fill_(0, new, 0)
+        is_point = points_world[:, 0].isfinite()
+        self._table[torch.where(is_point, _slots(cells), len(self._table) - 1)] = new.int()
+        pairs = self._pairs(cells, is_point)
+        offsets = self.buffer[:, pairs.old] - points_world.mT[:, pairs.new]
+        one = pairs.count.to(offsets)
+        x, y, z = torch.where(pairs.count, offsets, 0.0)
         squares = (x * x, x * y, x * z, y * y, y * z, z * z)
-        self._moments[new] = 0
-        self._moments[new].index_add_(0, row, torch.stack([ones, x, y, z, *squares], dim=1))
-        old = index < new.start  # pairs of new points occur twice, once from each side
-        mirrored = torch.stack([ones, -x, -y, -z, *squares], dim=1)
-        self._moments.index_add_(0, index[old], mirrored[old])
-        changed = torch.zeros(self._end - self._start, dtype=torch.bool, device=self._device)
-        changed[index - self._start] = True
-        changed[new.start - self._start :] = True
-        self._fit(changed.nonzero()[:, 0] + self._start)
+        self._moments.index_add_(0, new[pairs.new], torch.stack([one, x, y, z, *squares], dim=1))
+        # Pairs of new points occur twice, once from each side.
+        mirrored = torch.stack([one, -x, -y, -z, *squares], dim=1) * (pairs.old < first)[:, None]
+        self._moments.index_add_(0, pairs.old, mirrored)
+        self._fit(torch.cat([pairs.old, new]))
+
+    def _pairs(self, cells: Int[Tensor, "m 3"], is_point: Bool[Tensor, "m"]) -> "_Pairs":
+        """New points, just entered into the table, and the points in the 26 voxels around each of them."""
+        candidates = self._candidates(cells, 1)
+        occupied = candidates >= self.origin
+        if cuda_graphs.are_used_on(self._device):  # which does not ask how many there are
+            new = torch.arange(len(cells), device=self._device)[:, None].expand_as(candidates).flatten()
+            old, occupied = candidates.clamp_(min=self.origin).flatten().long(), occupied.flatten()
+        else:
+            new, column = occupied.nonzero(as_tuple=True)
+            old, occupied = candidates[new, column].long(), occupied[new, column]
+        offsets = self._cells[old] - cells[new]
+        # A slot may be another voxel's.
+        near = (offsets.abs().amax(dim=1) <= 1) & (offsets != 0).any(dim=1) & occupied & is_point[new]
+        pairs = _Pairs(new, old, near)
+        return pairs if cuda_graphs.are_used_on(self._device) else pairs.counted()
 
     def _fit(self, index: Int[Tensor, "m"]) -> None:
+        """Fit planes to places in the buffers; where nothing has changed nothing does."""
+        if not cuda_graphs.are_used_on(self._device):
+            index = self._once(index)
         moments = self._moments[index]
         n = moments[:, :1] + 1  # the point itself, at offset zero
         mx, my, mz = (moments[:, 1:4] / n).unbind(-1)
@@ -114,6 +159,12 @@ class AggregatedPoints(SlidingWindow):
         plane = fit_planes(moments[:, 4:] / n - outer)
         smallest_extent = _MIN_EXTENT * self.voxel_size_m
         self._normals[index] = plane.normals * _is_plane(moments[:, 0], plane.variances, smallest_extent)[:, None]
+
+    def _once(self, index: Int[Tensor, "m"]) -> Int[Tensor, "k"]:
+        """Each of the places once."""
+        occurs = torch.zeros(self._end - self._start, dtype=torch.bool, device=self._device)
+        occurs[index - self._start] = True
+        return occurs.nonzero()[:, 0] + self._start
 
     def _move_to_front(self, needed: int) -> None:
         super()._move_to_front(needed)
@@ -126,8 +177,26 @@ class AggregatedPoints(SlidingWindow):
 
     def _reserve(self, capacity: int) -> None:
         super()._reserve(capacity)
-        self._cells = torch.empty(capacity, 3, dtype=torch.int64, device=self._device)
+        self._cells = torch.empty(capacity, 3, dtype=torch.int32, device=self._device)
         self._moments = torch.empty(capacity, 10, device=self._device)
+
+
+def voxels_reached(reach_m: float, voxel_size_m: float) -> int:
+    """How many voxels in a row are at most that far from a point on either side."""
+    return math.ceil(round(2 * reach_m / voxel_size_m, 6)) + 1
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Pairs of neighbours: which of the new points, which place in the buffers, and whether the pair counts."""
+
+    new: Int[Tensor, "p"]
+    old: Int[Tensor, "p"]
+    count: Bool[Tensor, "p"]
+
+    def counted(self) -> "_Pairs":
+        """Those that count."""
+        return _Pairs(self.new[self.count], self.old[self.count], self.count[self.count])
 
 
 @functools.cache

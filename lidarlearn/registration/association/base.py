@@ -7,6 +7,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarlearn import cuda_graphs
+from lidarlearn.cuda_graphs import Recordings
+
 
 @dataclass(frozen=True)
 class Neighbours:
@@ -81,6 +84,26 @@ class Association(ABC):
     def normals(self) -> Float[Tensor, "m 3"]:
         """Their unit normals, zero where undefined."""
 
+    def points_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+        """Some of `points`, by their index."""
+        return self.points[index]
+
+    def normals_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+        """Some of `normals`, by their index."""
+        return self.normals[index]
+
+    @property
+    def recordings(self) -> Recordings | None:
+        """Of functions that search in this map, where all of that is done on its device; else None."""
+        return None
+
+    def reach_m(self, max_distance_m: float) -> float:
+        """A distance of a few, at least as long [m], in which as good as no more has to be looked at.
+
+        Recordings are of one search distance: fewer of them are needed.
+        """
+        return max_distance_m
+
     @property
     def is_empty(self) -> bool:
         """Whether there is nothing to search in."""
@@ -96,20 +119,21 @@ class Association(ABC):
             max_distance_m: farther points of the map are no neighbours [m].
             last: what was found for the same points where they stood before, in the same map. It changes nothing but
                 the work: a point that moved by less than half the lead of its neighbour over all others keeps it.
-                Left aside if it is of another number of points.
+                Left aside if it is of another number of points, and where looking up all is faster than asking which.
         """
         if self.is_empty:
             nothing = torch.zeros_like(points_world)
             return Correspondences(nothing, nothing, torch.zeros_like(points_world[:, 0], dtype=torch.bool))
         places = self.places(points_world)
-        if last is None or len(last.index) != len(points_world):
+        is_recorded = self.recordings is not None and cuda_graphs.are_used_on(points_world.device)
+        if last is None or len(last.index) != len(points_world) or is_recorded:
             neighbours = self.nearest(points_world, places, max_distance_m)
         else:
             neighbours = self._followed(points_world, places, max_distance_m, last)
         index = neighbours.index.clamp(min=0)
-        points = self.points[index]
+        points = self.points_at(index)
         within = (points - points_world).square().sum(dim=1) <= max_distance_m**2
-        return Correspondences(points, self.normals[index], within & (neighbours.index >= 0), neighbours)
+        return Correspondences(points, self.normals_at(index), within & (neighbours.index >= 0), neighbours)
 
     def places(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
         """In which part of the map each point looks for its neighbour: everywhere, if not defined otherwise."""
@@ -124,7 +148,7 @@ class Association(ABC):
     def _followed(self, points_world: Tensor, places: Tensor, max_distance_m: float, last: Neighbours) -> Neighbours:
         """Look up only what may have changed."""
         moved = (points_world - last.queries).norm(dim=1)
-        distances = (self.points[last.index.clamp(min=0)] - points_world).norm(dim=1)
+        distances = (self.points_at(last.index.clamp(min=0)) - points_world).norm(dim=1)
         distances = torch.where(last.index < 0, max_distance_m, distances.clamp(max=max_distance_m))
         stale = (distances > last.others_m - moved) | (places != last.places)
         which = stale.nonzero()[:, 0]

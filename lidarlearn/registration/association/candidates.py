@@ -1,5 +1,6 @@
 """The nearest two of a handful of candidates for each point."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,6 +31,14 @@ class NearestTwo:
             self.first_m.index_copy(0, which, first_m.minimum(by.first_m)),
             self.second_m.index_copy(0, which, second_m),
         )
+
+
+def joined(parts: Sequence[NearestTwo]) -> NearestTwo:
+    """Those of several sets of points behind each other."""
+    if len(parts) == 1:
+        return parts[0]
+    columns = zip(*((part.index, part.first_m, part.second_m) for part in parts), strict=True)
+    return NearestTwo(*map(torch.cat, columns))
 
 
 def nearest_two(

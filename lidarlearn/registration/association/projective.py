@@ -1,11 +1,16 @@
 """Neighbours that share a pixel of the spherical image."""
 
+import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarlearn import cuda_graphs
+from lidarlearn.cuda_graphs import Padding, Recordings
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.normals import normal_map
 from lidarlearn.geometry.projection import SphericalProjection, nearest_per_slot
@@ -13,6 +18,8 @@ from lidarlearn.geometry.ranges import squared_ranges
 from lidarlearn.registration.association.base import Association, Neighbours
 from lidarlearn.registration.association.candidates import nearest_two
 from lidarlearn.registration.association.sliding_window import SlidingWindow
+
+_PADDING, _MAP_PADDING = Padding(), Padding(least=1 << 19)
 
 
 class Projective(Association):
@@ -48,9 +55,9 @@ class Projective(Association):
     def clear(self) -> None:
         """Forget every scan."""
         self._window = SlidingWindow(self._device)
-        self._T_image_world = se3.identity()
+        self._T_image_world = se3.identity(device=self._device)
         self._layers = torch.empty(self.projection.pixels, 0, dtype=torch.int32, device=self._device)
-        self._oldest_layer = 0
+        self._next_layer = 0
 
     @property
     def points(self) -> Float[Tensor, "m 3"]:
@@ -62,23 +69,51 @@ class Projective(Association):
         """Their unit normals."""
         return self._window.normals
 
+    @property
+    def recordings(self) -> Recordings:
+        """Of functions that search in this map."""
+        return self._window.recordings
+
+    def points_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+        """Some of `points`, by their index."""
+        return self._window.points_at(index)
+
+    def normals_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+        """Some of `normals`, by their index."""
+        return self._window.normals_at(index)
+
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
         """Add a registered scan, and project it or, into a new image, the whole map."""
-        vertices = self.projection.vertex_map(points)
-        normals = normal_map(vertices)
-        used = (normals != 0).any(dim=0).flatten().nonzero()[:, 0]
-        vertices, normals = (image.flatten(1).index_select(1, used) for image in (vertices, normals))
-        R = T_world_lidar[:3, :3].to(normals)
-        forgotten = self._window.forget(frames - 1)
-        self._window.push(_moved(T_world_lidar, vertices), (R @ normals).mT)
-        if self._begins_image(T_world_lidar):
-            self._T_image_world = se3.inverse(T_world_lidar)
-            self._layers, self._oldest_layer = self._project(len(self._window)), 0
+        vertices, normals, is_used = self._recorded(self._surface, points, T_world_lidar, padding=_PADDING)
+        used = is_used.nonzero()[:, 0]
+        self._window.forget(frames - 1)
+        moved = self._window.push(vertices.index_select(1, used), normals.index_select(1, used).mT)
+        if self._begins_image(T_world_lidar, frames):
+            self._T_image_world.copy_(se3.inverse(T_world_lidar))
+            self._layers.copy_(self._project(frames))
+            self._next_layer = len(self._window) % frames
         else:
-            self._layers -= forgotten  # negative indices are no points, and the oldest layer holds nothing else now
-            new = self._project(1)[:, 0]
-            self._layers[:, self._oldest_layer] = torch.where(new < 0, -1, new + (len(self.points) - len(used)))
-            self._oldest_layer = (self._oldest_layer + 1) % self._layers.shape[1]
+            if moved:
+                self._layers -= moved
+            new = self._recorded(self._layer, vertices, is_used)
+            self._layers[:, self._next_layer] = torch.where(new < 0, -1, new + (self._window.end - len(used)))
+            self._next_layer = (self._next_layer + 1) % frames
+
+    def _recorded(self, function: Callable[..., Any], *inputs: Tensor, padding: Padding | None = None) -> Any:
+        return self.recordings(function, *inputs, device=self._device, settings=function.__name__, padding=padding)
+
+    def _surface(
+        self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"]
+    ) -> tuple[Float[Tensor, "3 pixels"], Float[Tensor, "3 pixels"], Bool[Tensor, "pixels"]]:
+        """Points of a scan's pixels and their normals, in the map's frame, and which of them there are."""
+        vertices = self.projection.vertex_map(points)
+        normals = normal_map(vertices).flatten(1)
+        R = T_world_lidar[:3, :3].to(normals)
+        return _moved(T_world_lidar, vertices.flatten(1)), R @ normals, (normals != 0).any(dim=0)
+
+    def reach_m(self, max_distance_m: float) -> float:
+        """All that is in a pixel is looked at."""
+        return math.inf
 
     def places(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
         """The pixel of each point, -1 outside the image."""
@@ -89,28 +124,56 @@ class Projective(Association):
     ) -> Neighbours:
         """The closest map point of each pixel."""
         candidates = self._layers.index_select(0, places.clamp(min=0))
-        nothing = (candidates < 0) | (places < 0)[:, None]
-        nearest = nearest_two(self._window.coordinates, candidates.clamp_(min=0), points_world, ~nothing)
-        index = torch.where(nearest.first_m < torch.inf, nearest.index, -1)
+        nothing = (candidates < self._window.origin) | (places < 0)[:, None]
+        candidates.clamp_(min=self._window.origin)
+        nearest = nearest_two(self._window.buffer, candidates, points_world, ~nothing)
+        index = torch.where(nearest.first_m < torch.inf, nearest.index - self._window.origin, -1)
         return Neighbours(points_world, places, index, nearest.second_m)
 
-    def _begins_image(self, T_world_lidar: Float[Tensor, "4 4"]) -> bool:
-        """Whether a scan sees the map from elsewhere than the image does, or needs a layer that there is not yet."""
-        is_growing = self._layers.shape[1] < len(self._window)
-        T_image_lidar = self._T_image_world @ T_world_lidar.to(self._T_image_world)
+    def _begins_image(self, T_world_lidar: Float[Tensor, "4 4"], frames: int) -> bool:
+        """Whether a scan sees the map from elsewhere than the image does, or there is none with so many layers."""
+        if self._layers.shape[1] != frames:
+            self._layers = self._layers.new_empty(self.projection.pixels, frames)
+            self.recordings.forget()
+            return True
+        T_image_lidar = self._T_image_world.cpu() @ T_world_lidar.cpu().double()
         distance_m = T_image_lidar[:3, 3].norm().item()
         tilt_deg = math.degrees(math.acos(min(T_image_lidar[2, 2].item(), 1.0)))
-        has_moved = distance_m >= self._image_distance_m or tilt_deg >= self._image_tilt_deg
-        return is_growing or has_moved or len(self._window) == 1
+        return distance_m >= self._image_distance_m or tilt_deg >= self._image_tilt_deg or len(self._window) == 1
 
-    def _project(self, scans: int) -> Int[Tensor, "pixels scans"]:
-        """Which of the last scans' points, as a layer for each scan, is the nearest in each pixel; -1 for none."""
-        coordinates, layers = self._window.last(scans)
+    def _project(self, layers: int) -> Int[Tensor, "pixels layers"]:
+        """Place in the buffer of the nearest point of each scan in each pixel, a layer for each; -1 for none."""
+        if not cuda_graphs.are_used_on(self._device):
+            return self._nearest_places(self._window.coordinates, self._window.scans, layers)
+        count = _MAP_PADDING.length(len(self.points))
+        numbers = torch.tensor([len(self.points), self._window.oldest_scan])
+        project = functools.partial(self._project_recorded, count, layers)
+        return self.recordings(project, numbers, device=self._device, settings=("_project", count, layers))
+
+    def _project_recorded(self, count: int, layers: int, numbers: Int[Tensor, "2"]) -> Int[Tensor, "pixels layers"]:
+        """The same of a number of points that is recorded, some of them twice."""
+        points, oldest_scan = numbers
+        places = self._window.origin + torch.arange(count, device=self._device) % points
+        coordinates, scans = self._window.at(places)
+        return self._nearest_places(coordinates, scans - oldest_scan.int(), layers)
+
+    def _nearest_places(
+        self, coordinates: Float[Tensor, "3 m"], scans: Int[Tensor, "m"], layers: int
+    ) -> Int[Tensor, "pixels layers"]:
         local = _moved(self._T_image_world, coordinates).mT
         # One pixel more, in front, for the points that fall into none.
-        slots = self.projection.pixel_index(local).add_(1).mul_(scans).add_(layers)
-        nearest = nearest_per_slot(slots, squared_ranges(local), (self.projection.pixels + 1) * scans)
-        return nearest[scans:].unflatten(0, (self.projection.pixels, scans)).contiguous()
+        slots = self.projection.pixel_index(local).add_(1).mul_(layers).add_(scans)
+        nearest = nearest_per_slot(slots, squared_ranges(local), (self.projection.pixels + 1) * layers)
+        nearest = nearest[layers:].unflatten(0, (self.projection.pixels, layers))
+        return torch.where(nearest < 0, -1, nearest + self._window.origin)
+
+    def _layer(self, coordinates: Float[Tensor, "3 m"], is_used: Bool[Tensor, "m"]) -> Int[Tensor, "pixels"]:
+        """Which of a scan's used points, counted from 0, is the nearest in each pixel of the image; -1 for none."""
+        local = _moved(self._T_image_world, coordinates).mT
+        slots = torch.where(is_used, self.projection.pixel_index(local), -1).add_(1)
+        nearest = nearest_per_slot(slots, squared_ranges(local), self.projection.pixels + 1)[1:]
+        number = is_used.cumsum(0, dtype=torch.int32) - 1
+        return torch.where(nearest < 0, -1, number[nearest.clamp(min=0)])
 
 
 def _moved(T: Float[Tensor, "4 4"], coordinates: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:

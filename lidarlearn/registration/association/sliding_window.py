@@ -4,12 +4,22 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarlearn import cuda_graphs
+
+_CAPACITY = 1 << 16  # points at first
+_CAPACITY_ON_GPU = 1 << 21  # as many as 30 scans need: where buffers move, all that was recorded is recorded again
+
 
 class SlidingWindow:
     """Points and normals of the last scans, oldest first: a new scan is written behind the others, none is moved.
 
     Coordinates lie apart in memory: projections and distances are computed axis by axis. Forgetting moves the start of
     a slice; only when the end of the buffers is reached, once in many scans, what is left moves to their front.
+
+    Attributes:
+        buffer: the coordinates (3, capacity), those of points that are forgotten or still to come among them.
+        origin: where the points begin in it, a number on the device.
+        recordings: of functions that read the buffers where they are.
 
     Args:
         device: where the points are kept.
@@ -20,7 +30,9 @@ class SlidingWindow:
         self._start = self._end = 0
         self._lengths: list[int] = []
         self._forgotten = 0
-        self._reserve(1 << 16)
+        self.origin = torch.zeros((), dtype=torch.int32, device=device)
+        self.recordings = cuda_graphs.Recordings()
+        self._reserve(_CAPACITY_ON_GPU if cuda_graphs.are_used_on(device) else _CAPACITY)
 
     @property
     def points(self) -> Float[Tensor, "n 3"]:
@@ -30,27 +42,51 @@ class SlidingWindow:
     @property
     def coordinates(self) -> Float[Tensor, "3 n"]:
         """The same, each coordinate of all points in one piece."""
-        return self._coordinates[:, self._start : self._end]
+        return self.buffer[:, self._start : self._end]
 
     @property
     def normals(self) -> Float[Tensor, "n 3"]:
         """Their unit normals, zero where undefined."""
         return self._normals[self._start : self._end]
 
+    def points_at(self, index: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
+        """Some of `points`, by their index."""
+        return self.buffer.index_select(1, index + self.origin).mT.contiguous()
+
+    def normals_at(self, index: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
+        """Some of `normals`, by their index."""
+        return self._normals.index_select(0, index + self.origin)
+
+    @property
+    def end(self) -> int:
+        """Where the points end in `buffer`."""
+        return self._end
+
     def __len__(self) -> int:
         """Number of scans."""
         return len(self._lengths)
 
-    def push(self, coordinates: Float[Tensor, "3 m"], normals: Float[Tensor, "m 3"]) -> None:
-        """Add a scan."""
-        new = self._append(coordinates)
+    def push(self, coordinates: Float[Tensor, "3 m"], normals: Float[Tensor, "m 3"]) -> int:
+        """Add a scan; returns by how much all others have moved to the front of the buffers."""
+        new, moved = self._claim(coordinates.shape[1])
+        self.buffer[:, new] = coordinates
         self._normals[new] = normals
+        self._scans[new] = self._forgotten + len(self) - 1
+        return moved
 
-    def last(self, scans: int) -> tuple[Float[Tensor, "3 m"], Int[Tensor, "m"]]:
-        """Coordinates of the points of the last scans, and which scan each comes from, 0 for the oldest of these."""
-        points = slice(self._end - sum(self._lengths[-scans:]), self._end)
-        first = self._forgotten + len(self._lengths) - scans
-        return self._coordinates[:, points], self._scans[points] - first
+    @property
+    def scans(self) -> Int[Tensor, "n"]:
+        """Which scan each point comes from, 0 for the oldest."""
+        return self._scans[self._start : self._end] - self.oldest_scan
+
+    def at(self, places: Int[Tensor, "m"]) -> tuple[Float[Tensor, "3 m"], Int[Tensor, "m"]]:
+        """Coordinates of the points at some places in the buffer, and the number of the scan each comes from."""
+        return self.buffer[:, places], self._scans[places]
+
+    @property
+    def oldest_scan(self) -> int:
+        """Number of the oldest scan that is left, counted from the first there was."""
+        return self._forgotten
 
     def forget(self, scans: int) -> int:
         """Keep the last `scans` scans at most; returns how many points are forgotten."""
@@ -58,34 +94,46 @@ class SlidingWindow:
         while len(self._lengths) > scans:
             self._start += self._lengths.pop(0)
             self._forgotten += 1
+        self.origin.fill_(self._start)
         return self._start - start
 
-    def _append(self, coordinates: Float[Tensor, "3 m"]) -> slice:
-        """Where the points of a new scan stand in the buffers."""
-        count = coordinates.shape[1]
-        if self._end + count > len(self._normals):
-            self._move_to_front(count)
+    @property
+    def _capacity(self) -> int:
+        return len(self._normals)
+
+    def _claim(self, count: int, spare: int = 0) -> tuple[slice, int]:
+        """Where the points of a new scan will stand in the buffers, and by how much the others have moved to the front.
+
+        Args:
+            count: how many they are.
+            spare: how many more places behind them may be written to.
+        """
+        moved = 0
+        if self._end + count + spare > self._capacity:
+            moved = self._start
+            self._move_to_front(count + spare)
         new = slice(self._end, self._end + count)
-        self._coordinates[:, new] = coordinates
-        self._scans[new] = self._forgotten + len(self._lengths)
         self._lengths.append(count)
         self._end = new.stop
-        return new
+        return new, moved
 
     def _move_to_front(self, needed: int) -> None:
-        """Into buffers that hold at least twice as many."""
-        living = [rows[self._start : self._end] for rows in self._rows()]
+        """Of these buffers or, where they would soon be full again, of larger ones."""
         count = self._end - self._start
-        self._reserve(max(2 * (count + needed), len(self._normals)))
+        living = [rows[self._start : self._end].clone() for rows in self._rows()]
+        if 2 * (count + needed) > self._capacity:
+            self._reserve(2 * (count + needed))
         for rows, content in zip(self._rows(), living, strict=True):
             rows[:count] = content
         self._start, self._end = 0, count
+        self.origin.zero_()
 
     def _rows(self) -> tuple[Tensor, ...]:
         """The buffers, one row a point."""
-        return self._coordinates.mT, self._normals, self._scans
+        return self.buffer.mT, self._normals, self._scans
 
     def _reserve(self, capacity: int) -> None:
-        self._coordinates = torch.empty(3, capacity, device=self._device)
+        self.buffer = torch.empty(3, capacity, device=self._device)
         self._normals = torch.empty(capacity, 3, device=self._device)
         self._scans = torch.empty(capacity, dtype=torch.int32, device=self._device)
+        self.recordings.forget()

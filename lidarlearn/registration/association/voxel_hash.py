@@ -6,11 +6,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarlearn import cuda_graphs
+from lidarlearn.cuda_graphs import Recordings
 from lidarlearn.registration.association.aggregated_map import AggregatedMap
+from lidarlearn.registration.association.aggregated_points import voxels_reached
 from lidarlearn.registration.association.base import Neighbours
-from lidarlearn.registration.association.candidates import NearestTwo, nearest_two
+from lidarlearn.registration.association.candidates import NearestTwo, joined, nearest_two
 
 _CANDIDATES_AT_ONCE = 1 << 19  # bounds the memory of a wide search
+_CANDIDATES_AT_ONCE_ON_GPU = 1 << 22
 _FEW_CANDIDATES = 1 << 16  # so many are looked at in the time that it takes to ask
 _MIN_RADIUS = 2  # voxels; points without a neighbour look so far, and need not look again soon
 _MAX_RADIUS = 4  # voxels; beyond, a search would visit more than 9^3 of them per point
@@ -25,10 +29,22 @@ class VoxelHash(AggregatedMap):
     Source: the option that Dellenbach et al. 2021, III-A "Local map and neighborhood", names as the way to be faster.
     """
 
+    @property
+    def recordings(self) -> Recordings:
+        """Of functions that search in this map."""
+        return self._map.recordings
+
+    def reach_m(self, max_distance_m: float) -> float:
+        """One of three: one voxel and a half, two, or as many as are ever looked at."""
+        reaches = (voxels * self._voxel_size_m for voxels in (1.5, _MIN_RADIUS))
+        return next((reach_m for reach_m in reaches if max_distance_m <= reach_m), math.inf)
+
     def nearest(
         self, points_world: Float[Tensor, "n 3"], places: Int[Tensor, "n"], max_distance_m: float
     ) -> Neighbours:
         """The nearest point in wider and wider cubes of voxels around each point, until none can be nearer."""
+        if cuda_graphs.are_used_on(points_world.device):
+            return self._nearest_at_once(points_world, places, max_distance_m)
         widest = max(_MIN_RADIUS, min(math.ceil(max_distance_m / self._voxel_size_m), _MAX_RADIUS))
         radius = 1
         while radius < widest and len(points_world) * (2 * radius + 3) ** 3 <= _FEW_CANDIDATES:
@@ -39,16 +55,18 @@ class VoxelHash(AggregatedMap):
             radius += 1
             found = found.improved(alone, self._within(points_world[alone], radius, inner=radius - 1))
             searched_m[alone] = radius * self._voxel_size_m
-        return Neighbours(points_world, places, found.index, torch.minimum(found.second_m, searched_m))
+        index = found.index - self._map.origin
+        return Neighbours(points_world, places, index, torch.minimum(found.second_m, searched_m))
 
     def _within(self, points: Float[Tensor, "n 3"], radius: int, inner: int = -1) -> NearestTwo:
         """The nearest of a cube of voxels around each point, see `AggregatedPoints.around`."""
         chunks = points.split(max(_CANDIDATES_AT_ONCE // (2 * radius + 1) ** 3, 1))
-        found = [nearest_two(self._map.coordinates, self._map.around(c, radius, inner), c) for c in chunks]
-        if len(found) == 1:
-            return found[0]
-        return NearestTwo(
-            torch.cat([part.index for part in found]),
-            torch.cat([part.first_m for part in found]),
-            torch.cat([part.second_m for part in found]),
-        )
+        return joined([nearest_two(self._map.buffer, self._map.around(c, radius, inner), c) for c in chunks])
+
+    def _nearest_at_once(self, points_world: Tensor, places: Tensor, max_distance_m: float) -> Neighbours:
+        """The same in the cube of voxels that the distance reaches, without asking what was found on the way."""
+        reach_m = min(max_distance_m, _MAX_RADIUS * self._voxel_size_m)
+        candidates = voxels_reached(reach_m, self._voxel_size_m) ** 3
+        chunks = points_world.split(max(_CANDIDATES_AT_ONCE_ON_GPU // candidates, 1))
+        found = joined([nearest_two(self._map.buffer, self._map.reached(c, reach_m), c) for c in chunks])
+        return Neighbours(points_world, places, found.index - self._map.origin, found.second_m.clamp(max=reach_m))

@@ -1,0 +1,134 @@
+"""What a scan's points say about its pose: matched with a map, weighted and linearized."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from lidarlearn import cuda_graphs
+from lidarlearn.geometry import se3
+from lidarlearn.registration.association.base import Association, Neighbours
+from lidarlearn.registration.normal_equations import NormalEquations, Terms, normal_equations
+from lidarlearn.registration.residuals import Residual
+from lidarlearn.registration.weights import RobustWeight
+
+_PADDING = cuda_graphs.Padding(value=1e6)  # with points [m] that are near to nothing
+
+_SumsAndTerms = tuple[Float64[Tensor, "*batch 7 7"], Terms]
+
+
+@dataclass(frozen=True)
+class Queries:
+    """Points to register.
+
+    Args:
+        points: in the new scan's frame [m].
+        normals: theirs, where the residual needs them.
+    """
+
+    points: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"] | None
+
+    def every(self, stride: int) -> "Queries":
+        """Every so manieth of them."""
+        return Queries(self.points[::stride], None if self.normals is None else self.normals[::stride])
+
+
+@dataclass(frozen=True)
+class Matching:
+    """Makes the normal equations of a scan at a pose.
+
+    Args:
+        residual: what is minimized.
+        weight: the robust weight.
+        search_distance_m: the final one, at which the weight has its own scale [m].
+        association: the map.
+    """
+
+    residual: Residual
+    weight: RobustWeight
+    search_distance_m: float
+    association: Association
+
+    def equations(
+        self,
+        queries: Queries,
+        T_world_lidar: Float64[np.ndarray, "*batch 4 4"],
+        distance_m: float,
+        last: Neighbours | None = None,
+    ) -> NormalEquations:
+        """The equations at one or several poses.
+
+        Args:
+            queries: the scan.
+            T_world_lidar: the poses.
+            distance_m: how far neighbours are searched [m].
+            last: what was found before, see `Association.search`.
+        """
+        points, recordings = queries.points, self.recordings(queries)
+        if recordings is None:
+            T = torch.from_numpy(T_world_lidar).to(points)
+            sums, terms = self._terms(points, T, distance_m, distance_m, queries.normals, last)
+            return normal_equations(sums.cpu(), terms, len(points))
+        reach_m = self.association.reach_m(distance_m)
+        sums, terms = recordings(
+            functools.partial(self._recorded_terms, shape=T_world_lidar.shape, reach_m=reach_m),
+            points,
+            torch.from_numpy(np.append(T_world_lidar, distance_m)),  # sent at once
+            device=points.device,
+            settings=(self.residual, self.weight, self.search_distance_m, reach_m, T_world_lidar.shape),
+            padding=_PADDING,
+            keeps_first=True,
+            reads_first=True,
+        )
+        return normal_equations(sums, terms, len(points))
+
+    def recordings(self, queries: Queries) -> cuda_graphs.Recordings | None:
+        """Where this is recorded, if it is: not for generalized ICP, which inverts matrices."""
+        is_recorded = cuda_graphs.are_used_on(queries.points.device) and queries.normals is None
+        return self.association.recordings if is_recorded else None
+
+    def _recorded_terms(
+        self, points: Float[Tensor, "n 3"], numbers: Float[Tensor, "_"], shape: tuple[int, ...], reach_m: float
+    ) -> _SumsAndTerms:
+        numbers = numbers.to(points)
+        return self._terms(points, numbers[:-1].view(shape), numbers[-1], reach_m)
+
+    def _terms(
+        self,
+        points: Float[Tensor, "n 3"],
+        T: Float[Tensor, "*batch 4 4"],
+        distance_m: float | Float[Tensor, ""],
+        reach_m: float,
+        normals: Float[Tensor, "n 3"] | None = None,
+        last: Neighbours | None = None,
+    ) -> _SumsAndTerms:
+        """Neighbours are searched within `reach_m` and count within `distance_m`."""
+        points_world = se3.transform(T, points)
+        found = self.association.search(points_world.reshape(-1, 3), reach_m, last)
+        map_points = found.points.view_as(points_world)
+        map_normals = found.normals.view_as(points_world)
+        mask = (found.mask & (found.normals != 0).any(dim=-1)).view(points_world.shape[:-1])
+        linear = self.residual.linearize(T, points, points_world, map_points, map_normals, normals)
+        offsets = points_world - map_points
+        is_distance = linear.residuals.shape[-1] == 1
+        size = linear.residuals[..., 0].abs() if is_distance else linear.residuals.norm(dim=-1)
+        widening = distance_m / self.search_distance_m  # a narrow kernel would hold on to whatever is near by chance
+        squared_distances = offsets.square().sum(-1)
+        if isinstance(distance_m, Tensor):
+            mask = mask & (squared_distances <= distance_m**2)
+        weights = self.weight.weight(size / widening, squared_distances / widening**2) * mask
+        # Summed in single precision, H would no longer tell "nothing is known" from its own rounding.
+        rows = linear.rows.double()
+        sums = (rows * weights[..., None, None]).flatten(-3, -2).mT @ rows.flatten(-3, -2)
+        return sums, Terms(
+            found=found.neighbours,
+            mask=mask,
+            # Whatever is minimized, a pose is judged by how far points are off the map's surface, not along it.
+            off_m=size if is_distance else (offsets * map_normals).sum(-1).abs(),
+            weights=weights,
+            jacobians=linear.jacobians,
+        )
