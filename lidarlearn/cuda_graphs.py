@@ -5,6 +5,7 @@ A scan takes a GPU a thousand small operations, and the CPU longer to ask for ea
 
 import contextlib
 import functools
+import warnings
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -55,7 +56,11 @@ class Recording:
         inputs: arguments, on the device.
         sent: places on the CPU, pinned, from where those arguments that have one come; None for others.
         answer: a place on the CPU, pinned, for the result or the first of several; None where it stays.
+        device: where it computes.
         pool: memory that it shares with others.
+
+    Raises:
+        RuntimeError: CUDA does not record what the function does.
     """
 
     def __init__(
@@ -64,6 +69,7 @@ class Recording:
         inputs: Sequence[Tensor],
         sent: Sequence[Tensor | None],
         answer: Tensor | None,
+        device: torch.device,
         pool: Any,
     ) -> None:
         def run() -> Any:
@@ -75,9 +81,10 @@ class Recording:
                 answer.copy_(_first(result), non_blocking=True)
             return result
 
-        self._graph, self._result = _captured(run, pool)
+        with torch.cuda.device(device):
+            self._graph, self._result = _captured(run, pool)
+            self._stream, self._done = torch.cuda.current_stream(), torch.cuda.Event()
         self._is_read, self._is_sent = answer is not None, any(value is not None for value in sent)
-        self._stream, self._done = torch.cuda.current_stream(), torch.cuda.Event()
 
     def wait(self) -> None:
         """Until what was sent for the last time has arrived."""
@@ -120,7 +127,7 @@ def _capture_stream(device: int) -> torch.cuda.Stream:
 class Recordings:
     """Calls functions of tensors; on a GPU each is recorded when it comes the second time, and replayed from then on.
 
-    Where there are no CUDA graphs functions are simply called.
+    Where there are no CUDA graphs functions are simply called, and so are those of which CUDA does not make one.
 
     A result is good until any of the functions is called again: the memory of the next one may be the same.
     """
@@ -196,10 +203,10 @@ class _Prepared:
         both = list(zip(inputs, shapes, strict=True))
         self._inputs = [torch.empty(shape, dtype=value.dtype, device=device) for value, shape in both]
         self._sent = [_pinned(shape, value.dtype) if value.device.type == "cpu" else None for value, shape in both]
-        self._pool, self._padding, self._reads_first = pool, padding, reads_first
+        self._device, self._pool, self._padding, self._reads_first = device, pool, padding, reads_first
         self._answer: Tensor | None = None
         self._first: Tensor | None = None
-        self._has_come = False
+        self._has_come = self._is_refused = False
         self._recording: Recording | None = None
 
     def __call__(self, function: Callable[..., Any], inputs: Sequence[Tensor], keeps_first: bool) -> Any:
@@ -209,20 +216,27 @@ class _Prepared:
         for i, given in enumerate(inputs):
             if i or not (keeps_first and given is self._first):
                 self._write(i, given)
-        if not self._has_come:
-            return self._call(function)
+        if self._has_come and self._recording is None and not self._is_refused:
+            self._record(function)
         if self._recording is None:
-            self._recording = Recording(function, self._inputs, self._sent, self._answer, self._pool)
+            return self._call(function)
         result = self._recording.replay()
         return result if self._answer is None else _replaced(result, self._answer)
 
+    def _record(self, function: Callable[..., Any]) -> None:
+        try:
+            self._recording = Recording(function, self._inputs, self._sent, self._answer, self._device, self._pool)
+        except RuntimeError as error:
+            self._is_refused = True
+            reason = str(error).partition("\n")[0]
+            warnings.warn(f"{function} is slower than it could be, it cannot be a CUDA graph: {reason}", stacklevel=4)
+
     def _call(self, function: Callable[..., Any]) -> Any:
-        """For the first time."""
-        self._has_come = True
         for place, value in zip(self._inputs, self._sent, strict=True):
             if value is not None:
                 place.copy_(value)
         result = function(*self._inputs)
+        self._has_come = True
         if not self._reads_first:
             return result
         self._answer = _pinned(_first(result).shape, _first(result).dtype)

@@ -57,13 +57,17 @@ class PretendedRecording:
         inputs: Sequence[Tensor],
         sent: Sequence[Tensor | None],
         answer: Tensor | None,
+        device: torch.device,
         pool: Any,
     ) -> None:
         self._inputs, self._sent, self._answer = inputs, sent, answer
         self._receive()
-        with _Notes() as notes:
-            self._result = function(*inputs)
-        notes.undo()
+        notes = _Notes()
+        try:
+            with notes:
+                self._result = function(*inputs)
+        finally:
+            notes.undo()
         self._operations = notes.operations
 
     def wait(self) -> None:

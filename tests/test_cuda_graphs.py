@@ -73,13 +73,23 @@ def test_nothing_is_recorded_of_nothing(monkeypatch):
     assert not made
 
 
-def test_what_would_have_to_be_answered_is_refused(monkeypatch):
-    """The pretended recorder does its work."""
+def test_what_cannot_be_recorded_is_called_and_told_once(monkeypatch):
+    """Such as a robust weight of one's own that asks for a number."""
     pretended_graphs.pretend(monkeypatch)
-    recordings = Recordings()
-    recordings(lambda values: values[values > 0], torch.ones(3), device=CPU)
-    with pytest.raises(RuntimeError, match="the GPU would have to answer"):
-        recordings(lambda values: values[values > 0], torch.ones(3), device=CPU)
+    recordings, seen = Recordings(), torch.zeros(3)
+
+    def positive(values: Tensor) -> Tensor:
+        seen.add_(values)
+        return values[values > 0]
+
+    def call() -> Tensor:
+        return recordings(positive, torch.tensor([1.0, -1.0, 2.0]), device=CPU, reads_first=True)
+
+    assert call().tolist() == [1.0, 2.0]
+    with pytest.warns(UserWarning, match="cannot be a CUDA graph: .* the GPU would have to answer"):
+        assert call().tolist() == [1.0, 2.0]
+    assert call().tolist() == [1.0, 2.0]
+    assert seen.tolist() == [3.0, -3.0, 6.0]
 
 
 @pytest.mark.parametrize("padding", [Padding(), Padding(least=4096), Padding(to_power_of_two=True)])
