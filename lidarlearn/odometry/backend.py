@@ -75,6 +75,7 @@ class Backend:
             T_world_previous @ T_previous_new,
             distance_m,
             self.normals(points, scan.queries),
+            scan.phases[scan.queries],
         )
 
     def best_hypothesis(

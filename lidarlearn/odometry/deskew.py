@@ -26,5 +26,10 @@ def deskew(
     step = ((times - earliest) / max(latest - earliest, 1e-6) * (_STEPS - 1)).round().long()
     instants = torch.linspace(earliest, latest, _STEPS, dtype=torch.float64)
     T_pose_instant = se3.exp(instants[:, None] * se3.log(T_previous_new)).to(points)
-    R, t = T_pose_instant[:, :3, :3][step], T_pose_instant[:, :3, 3][step]
-    return (R @ points[..., None])[..., 0] + t
+    rows = T_pose_instant[:, :3].permute(1, 2, 0).contiguous()  # of each, the four numbers apart in memory
+    x, y, z = points.unbind(1)
+    coordinates = []
+    for row in rows:
+        a, b, c, t = row.index_select(1, step)
+        coordinates.append(t.addcmul_(a, x).addcmul_(b, y).addcmul_(c, z))
+    return torch.stack(coordinates).mT

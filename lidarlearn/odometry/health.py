@@ -24,6 +24,8 @@ class Health:
         overlap: share of the points that have a neighbour in the map.
         inlier_share: share of those that fit it.
         rmse_m: weighted root mean square of the residuals [m].
+        skew_m: length of the motion that the compensation of the scan left over, over a scan period [m].
+        skew_deg: angle of the same [deg].
         min_information: share of the points that notice a move in the weakest direction.
         degenerate: whether that is too little, so that the motion in this direction is a prediction.
         weakest_direction: that direction, a unit vector in the sensor's frame.
@@ -41,6 +43,8 @@ class Health:
     overlap: float | None = None
     inlier_share: float | None = None
     rmse_m: float | None = None
+    skew_m: float | None = None
+    skew_deg: float | None = None
     min_information: float | None = None
     degenerate: bool = False
     weakest_direction: tuple[float, ...] | None = None

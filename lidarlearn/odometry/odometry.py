@@ -123,7 +123,7 @@ class Odometry(ScanByScan):
         self._fits.append(attempt.result.fit.item())
         self._surprises_m.append(_displacement_m(scan, T_previous_new, attempt.motion))
         self._trust(attempt.motion, attempt.health)
-        self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
+        self._backend.local_map.update(scan.deskewed(self._motion, attempt.result.skew), self._T_world_lidar)
         self._first = None
         self._coasting = 0
         return attempt.health
@@ -186,6 +186,8 @@ class Odometry(ScanByScan):
             overlap=result.overlap.item(),
             inlier_share=result.inlier_share.item(),
             rmse_m=result.rmse_m.item(),
+            skew_m=result.skew[:3].norm().item(),
+            skew_deg=math.degrees(result.skew[3:].norm().item()),
             min_information=information,
             degenerate=information < self._judgement.min_information,
             weakest_direction=tuple(result.weakest_direction.tolist()),

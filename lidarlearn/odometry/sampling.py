@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarlearn.cuda_graphs import Padding, Recordings
+from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import grid_sample
 from lidarlearn.odometry.deskew import deskew
@@ -74,9 +75,29 @@ class SampledScan:
         """Mean distance of the points from the sensor [m]."""
         return self.points.norm(dim=1).mean().item()
 
-    def deskewed(self, T_previous_new: Float[Tensor, "4 4"]) -> Float[Tensor, "n 3"]:
-        """All points, compensated for the motion over one scan period."""
-        return deskew(self.points, self.times, T_previous_new)
+    @functools.cached_property
+    def phases(self) -> Float[Tensor, "n"]:
+        """When each point was measured, as a share of the scan period: its time or, where unknown, after its azimuth.
+
+        A LiDAR turns clockwise as seen from above. Where the turn begins nobody says; a pose is that of the middle.
+        """
+        if self.times is not None:
+            return self.times
+        return torch.atan2(self.points[:, 1], self.points[:, 0]) / (-2 * math.pi)
+
+    def deskewed(
+        self, T_previous_new: Float[Tensor, "4 4"], skew: Float[Tensor, "6"] | None = None
+    ) -> Float[Tensor, "n 3"]:
+        """All points, compensated for the motion over one scan period, and for what was left over of it.
+
+        Args:
+            T_previous_new: the motion; scans without times are compensated already.
+            skew: see `RegistrationResult.skew`.
+        """
+        if skew is None:
+            return deskew(self.points, self.times, T_previous_new)
+        known = torch.zeros_like(skew) if self.times is None else se3.log(T_previous_new)
+        return deskew(self.points, self.phases, se3.exp(known + skew))
 
 
 class Sampling(ABC):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.registration.association.base import Association
+from lidarlearn.registration.elasticity import Elasticity
 from lidarlearn.registration.matching import Matching, Queries
 from lidarlearn.registration.normal_equations import NormalEquations, Position, Terms, position_of
 from lidarlearn.registration.residuals import PointToPlane, Residual
@@ -42,6 +43,7 @@ class GaussNewton:
         rotation_tolerance_deg: ...and turns by less [deg].
         max_step_m: longest translation of one step [m].
         max_step_deg: largest rotation of one step [deg].
+        elasticity: how far scans give way whose points say when they were measured; None: not at all.
     """
 
     residual: Residual = field(default_factory=PointToPlane)
@@ -53,10 +55,11 @@ class GaussNewton:
     min_information: float = 1e-3
     inlier_residual_m: float = 0.2
     fit_residual_m: float = 0.05
-    translation_tolerance_m: float = 1e-3
-    rotation_tolerance_deg: float = 5e-3
+    translation_tolerance_m: float = 2e-3
+    rotation_tolerance_deg: float = 1e-2
     max_step_m: float = 1.0
     max_step_deg: float = 10.0
+    elasticity: Elasticity | None = field(default_factory=Elasticity)
 
     def __post_init__(self) -> None:
         if not (0 < self.narrowing < 1 and self.search_distance_m > 0):
@@ -85,6 +88,7 @@ class GaussNewton:
         T_world_lidar: Float[Tensor, "*batch 4 4"],
         search_distance_m: float,
         normals: Float[Tensor, "n 3"] | None = None,
+        phases: Float[Tensor, "n"] | None = None,
     ) -> RegistrationResult:
         """Move the scan to where it fits the map, from one or several initial poses at once.
 
@@ -94,6 +98,7 @@ class GaussNewton:
             T_world_lidar: initial poses, float64, on any device.
             search_distance_m: search distance of the first iteration [m].
             normals: unit normals of the new scan; only generalized ICP needs them.
+            phases: when each point was measured, as a share of the scan period; without, the scan is rigid.
 
         Returns:
             The result; with nothing to hold on to, the initial pose, not converged, with an overlap of 0.
@@ -113,15 +118,20 @@ class GaussNewton:
             found = equations.terms.found
             position = position_of(equations)
             step = np.where(converged[..., None], 0.0, self._step(equations, position))
-            T = T @ motion(step)
+            T_last, T = T, T @ motion(step)
             if final:
                 is_small = (lengths(step) < self._tolerances).all(-1)
                 converged = np.asarray(converged | (is_small & (equations.H != 0).any((-2, -1))))
             distance_m *= self.narrowing
         if not converged.all():  # else the last equations describe all of them, but for a small step
             equations = matching.equations(queries, T, self.search_distance_m, found)
-            position = position_of(equations)
-        return self._judge(T, iterations, converged, equations, position)
+            position, T_last = position_of(equations), T
+        skew = np.zeros((*T.shape[:-2], 6))
+        if phases is not None and self.elasticity is not None:
+            elastic = self.elasticity.equations(equations, phases)
+            step = self._step(elastic.pose, position_of(elastic.pose))
+            T, skew = T_last @ motion(step), elastic.skew(step)
+        return self._judge(T, skew, iterations, converged, equations, position)
 
     def agreement(
         self,
@@ -163,6 +173,7 @@ class GaussNewton:
     def _judge(
         self,
         T: Float64[np.ndarray, "*batch 4 4"],
+        skew: Float64[np.ndarray, "*batch 6"],
         iterations: int,
         converged: Bool[np.ndarray, "*batch"],
         equations: NormalEquations,
@@ -177,6 +188,7 @@ class GaussNewton:
         weakest = np.take_along_axis(position.directions, order[..., None, :], axis=-1)[..., 0]
         return RegistrationResult(
             T_world_lidar=se3.orthonormalize(torch.from_numpy(T)),
+            skew=torch.from_numpy(skew),
             iterations=iterations,
             converged=torch.as_tensor(converged),
             overlap=torch.as_tensor(neighbours / points),

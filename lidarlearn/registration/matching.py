@@ -11,7 +11,7 @@ from torch import Tensor
 from lidarlearn import cuda_graphs
 from lidarlearn.geometry import se3
 from lidarlearn.registration.association.base import Association, Neighbours
-from lidarlearn.registration.normal_equations import NormalEquations, Terms, normal_equations
+from lidarlearn.registration.normal_equations import NormalEquations, Terms, normal_equations, weighted_sums
 from lidarlearn.registration.residuals import Residual
 from lidarlearn.registration.weights import RobustWeight
 
@@ -121,14 +121,11 @@ class Matching:
         if isinstance(distance_m, Tensor):
             mask = mask & (squared_distances <= distance_m**2)
         weights = self.weight.weight(size / widening, squared_distances / widening**2) * mask
-        # Summed in single precision, H would no longer tell "nothing is known" from its own rounding.
-        rows = linear.rows.double()
-        sums = (rows * weights[..., None, None]).flatten(-3, -2).mT @ rows.flatten(-3, -2)
-        return sums, Terms(
+        return weighted_sums(linear.rows.double(), weights), Terms(
             found=found.neighbours,
             mask=mask,
             # Whatever is minimized, a pose is judged by how far points are off the map's surface, not along it.
             off_m=size if is_distance else (offsets * map_normals).sum(-1).abs(),
             weights=weights,
-            jacobians=linear.jacobians,
+            rows=linear.rows,
         )

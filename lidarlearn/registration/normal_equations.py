@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lidarlearn.cuda_graphs import Recordings
 from lidarlearn.registration.association.base import Neighbours
@@ -30,7 +31,7 @@ class Terms:
         mask: which points have a neighbour with a normal.
         off_m: how far each of them is off the map's surface [m].
         weights: of each point.
-        jacobians: of the residuals of each point.
+        rows: derivatives of the residuals of each point and the residuals, side by side, see `Linearization`.
         recordings: of functions of these.
     """
 
@@ -38,7 +39,7 @@ class Terms:
     mask: Bool[Tensor, "*batch m"]
     off_m: Float[Tensor, "*batch m"]
     weights: Float[Tensor, "*batch m"]
-    jacobians: Float[Tensor, "*batch m k 6"]
+    rows: Float[Tensor, "*batch m k 7"]
     recordings: Recordings = field(default_factory=Recordings)
 
     def noticed(self, responses: Float64[np.ndarray, "*batch 6 3"]) -> Float[np.ndarray, "*batch 3"]:
@@ -47,9 +48,18 @@ class Terms:
         return self.recordings(self._noticed, moves, device=device, reads_first=True).numpy()
 
     def _noticed(self, responses: Float[Tensor, "*batch 6 3"]) -> Float[Tensor, "*batch 3"]:
-        moves = self.jacobians.flatten(-3, -2) @ responses.to(self.jacobians)
-        notices = (moves.abs() > _NOTICEABLE).to(moves).view(*self.jacobians.shape[:-1], 3).mean(-2)
+        moves = self.rows[..., :6].flatten(-3, -2) @ responses.to(self.rows)
+        notices = (moves.abs() > _NOTICEABLE).to(moves).view(*self.rows.shape[:-1], 3).mean(-2)
         return (self.weights[..., None, :] @ notices)[..., 0, :]
+
+    def moments(self, phases: Float[Tensor, "n"]) -> Float64[np.ndarray, "2 *batch 7 7"]:
+        """Sums as those of the normal equations, with each point's weight times its phase, and times its square."""
+        phases = pad(phases, (0, self.weights.shape[-1] - len(phases)))
+        return self.recordings(self._moments, phases, device=self.weights.device, reads_first=True).numpy().copy()
+
+    def _moments(self, phases: Float[Tensor, "m"]) -> Float64[Tensor, "2 *batch 7 7"]:
+        rows, weights = self.rows.double(), self.weights * phases
+        return torch.stack([weighted_sums(rows, weights), weighted_sums(rows, weights * phases)])
 
 
 @dataclass(frozen=True)
@@ -88,11 +98,21 @@ class Position:
     information: Float[np.ndarray, "*batch 3"]
 
 
+def weighted_sums(
+    rows: Float64[Tensor, "*batch m k 7"], weights: Float[Tensor, "*batch m"]
+) -> Float64[Tensor, "*batch 7 7"]:
+    """Sums of w (J, r)^T (J, r) over all points: Hessian, gradient and squares of the energy side by side.
+
+    In single precision, H would no longer tell "nothing is known" from its own rounding.
+    """
+    return (rows * weights[..., None, None]).flatten(-3, -2).mT @ rows.flatten(-3, -2)
+
+
 def normal_equations(sums: Float64[Tensor, "*batch 7 7"], terms: Terms, points: int) -> NormalEquations:
     """The equations of so many points.
 
     Args:
-        sums: of w (J, r)^T (J, r) over all points, on the CPU: Hessian, gradient and squares side by side.
+        sums: see `weighted_sums`, on the CPU.
         terms: of the points, and perhaps of more that say nothing.
         points: how many there are.
     """

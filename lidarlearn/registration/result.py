@@ -14,6 +14,8 @@ class RegistrationResult:
 
     Args:
         T_world_lidar: the registered poses, float64.
+        skew: motion over the scan period that the compensation of the points left over, as a twist of (translation
+            [m], rotation [rad]) in the sensor's frame, see `Elasticity`; zero where none was looked for.
         iterations: Gauss-Newton steps taken, those of the slowest of a batch.
         converged: whether the last step was below the tolerances, at the final search distance.
         overlap: share of the points that have a map neighbour with a normal within the search distance.
@@ -28,6 +30,7 @@ class RegistrationResult:
     """
 
     T_world_lidar: Float[Tensor, "*batch 4 4"]
+    skew: Float[Tensor, "*batch 6"]
     iterations: int
     converged: Bool[Tensor, "*batch"]
     overlap: Float[Tensor, "*batch"]

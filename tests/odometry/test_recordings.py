@@ -32,7 +32,7 @@ def test_a_recorded_drive_is_the_same(association, map_, monkeypatch):
     monkeypatch.setattr(sliding_window, "_CAPACITY_ON_GPU", 1 << 14)
     there = run(built(f"{association}_{map_}"), drive)
     translations, angles = motion_errors(poses(there), poses(here))
-    assert translations.max() < 5e-4 and angles.max() < 5e-3  # half of a step that ends a registration
+    assert translations.max() < 5e-4 and angles.max() < 5e-3  # less than a step that ends a registration
     assert len(made) >= 8
     for a, b in zip(here, there, strict=True):
         assert (a.health.status, a.health.points) == (b.health.status, b.health.points)
