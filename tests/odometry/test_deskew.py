@@ -10,7 +10,7 @@ from lidarlearn.odometry.deskew import deskew
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor
-from tests.odometry.odometries import build, kd_at_least, motion_errors, poses, run
+from tests.odometry.odometries import build, kd_at_least, motion_errors, poses, run, scans_of, street
 
 MOTION = se3.exp(torch.tensor([1.3, 0.1, -0.05, 0.01, -0.02, 0.09], dtype=torch.float64))
 QUIET = Sensor("quiet", tuple(float(e) for e in range(10, -20, -2)), 256, range_noise=0.0, drop_out=0.0, reach=math.inf)
@@ -77,3 +77,21 @@ def test_deskewing_lowers_the_error_at_high_speed_and_when_the_sensor_swings(wor
     assert errors[0].mean() < 0.8 * skewed_errors[0].mean()
     assert errors[1].mean() < 0.9 * skewed_errors[1].mean()
     assert ape_rmse(poses(deskewed), drive.T_world_lidar) < 0.5 * ape_rmse(poses(skewed), drive.T_world_lidar)
+
+
+@kd_at_least
+def test_scans_that_were_compensated_unlike_each_other_are_bent(association):
+    """Every second one is skewed by 9 cm, as in KITTI 04, and by 0.2 deg."""
+    drive, skew = street(), torch.tensor([0.09, 0.02, 0, 0, -0.003, 0.003], dtype=torch.float64)
+    scans = [
+        deskew(points, torch.atan2(points[:, 1], points[:, 0]) / (-2 * math.pi), se3.exp(-skew * (i % 2)))
+        for i, points in enumerate(scans_of(drive))
+    ]
+    name = f"{association}_f2m"
+    elastic = run(build(f"cv+{name}"), scans)
+    rigid = run(build(f"cv+{name}", f"odometry.{name}.registration.elasticity=null"), scans)
+    error, rigid_error = (motion_errors(poses(f), drive.T_world_lidar)[0].mean() for f in (elastic, rigid))
+    assert error < 0.8 * rigid_error
+    sizes = [frame.health.skew_m for frame in elastic[2:]]
+    assert sum(sizes[1::2]) > 1.5 * sum(sizes[::2])  # bent are those that are skewed
+    assert all(frame.health.skew_m == frame.health.skew_deg == 0 for frame in rigid[1:])

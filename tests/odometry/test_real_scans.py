@@ -37,10 +37,13 @@ def assert_no_failure(frames: list[Frame], true: Tensor) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("association", "mean_rpe_m", "ape_m"), [("kd", 0.0185, 0.030), ("vh", 0.0185, 0.030), ("p", 0.018, 0.045)]
+    ("association", "mean_rpe_m", "ape_m"), [("kd", 0.016, 0.030), ("vh", 0.016, 0.030), ("p", 0.018, 0.045)]
 )
 def test_kitti_04(real_data, association, mean_rpe_m, ape_m, record_property):
-    """Kd and VH measure 1.81 cm. KISS-ICP 1.3.0 on the same scans: mean RPE 2.2 cm, APE 0.026 m."""
+    """Kd and VH measure 1.40 cm, P 1.50. KISS-ICP 1.3.0 on the same scans: mean RPE 2.2 cm, APE 0.026 m.
+
+    As published, two of five of these scans are skewed by 9 cm from beginning to end; rigid ones give 1.8 and 1.6 cm.
+    """
     sequence, scans = opened("kitti_00-08", real_data / "kitti_odometry", "04")
     true = sequence.T_world_lidar[: len(scans)]
     frames = run(build(f"cv+{association}_f2m"), [scan.points for scan in scans])
@@ -75,8 +78,8 @@ def test_the_other_residuals_hold_on_kitti_04(real_data, association, residual, 
 def test_deskewed_scans_of_kitti_raw_0009_fit_better(real_data, association, record_property):
     """The errors say less: GPS and IMU are 2 cm a scan aside of the scans' motion and jump by 3 cm.
 
-    Skewed scans give trajectories as good, up to what the mean of 30 errors is known to (0.4 mm for kd and vh). That
-    deskewing lowers the error, where the truth is known exactly, is tested in test_deskew.py.
+    Kd and VH measure 2.39 cm against 2.42 of skewed scans, lower by 0.0 to 0.3 mm with other lots for the points of
+    voxels. That deskewing lowers the error, where the truth is known exactly, is tested in test_deskew.py.
     """
     sequence, scans = opened("kitti_raw", real_data / "kitti_raw", "2011_09_26_drive_0009")
     true = sequence.T_world_lidar[: len(scans)]
@@ -87,9 +90,8 @@ def test_deskewed_scans_of_kitti_raw_0009_fit_better(real_data, association, rec
     assert_no_failure(deskewed, true)
     errors, skewed_errors = (motion_errors(poses(frames), true)[0] for frames in (deskewed, skewed))
     record_property("mean_rpe_m", [errors.mean().item(), skewed_errors.mean().item()])
-    gain = skewed_errors - errors
     assert errors.mean() < 0.03
-    assert gain.mean() > (0 if association == "p" else -gain.std() / len(gain) ** 0.5)
+    assert errors.mean() < skewed_errors.mean()
     rmse, skewed_rmse = (sum(frame.health.rmse_m for frame in frames[1:]) for frames in (deskewed, skewed))
     assert rmse < 0.99 * skewed_rmse
 
@@ -121,7 +123,7 @@ def test_turning_pairs_of_kitti_00(real_data, association, pair):
 
 @all_associations
 def test_the_pair_of_an_hdl_32(real_data, association):
-    """Measured: 1.0-1.6 cm and 0.26-0.27 deg, in roll, and the same in all associations, forwards and backwards.
+    """Measured: 1.1-1.4 cm and 0.25-0.27 deg, in roll, and the same in all associations, forwards and backwards.
 
     The truth that comes with the pair is itself a registration: small_gicp's GICP on a grid of 0.1 m returns it to
     0.001 deg, on one of 0.25 m it is 0.33 deg off. Our grids from 0.1 to 0.4 m are 0.25 to 0.30 deg off, that of 0.8 m,
