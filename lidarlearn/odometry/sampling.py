@@ -94,7 +94,7 @@ class SampledScan:
             T_previous_new: the motion; scans without times are compensated already.
             skew: see `RegistrationResult.skew`.
         """
-        if skew is None:
+        if skew is None or not skew.any():
             return deskew(self.points, self.times, T_previous_new)
         known = torch.zeros_like(skew) if self.times is None else se3.log(T_previous_new)
         return deskew(self.points, self.phases, se3.exp(known + skew))

@@ -91,8 +91,7 @@ def test_agrees_with_all_twelve_unknowns_at_once(residual, batch):
     J, r = rows[..., :6], rows[..., 6]
     both = torch.cat([J, J * phases.double()[:, None, None]], dim=-1) * weights.sqrt()[:, None, None]
     residuals = r * weights.sqrt()[:, None]
-    axes = 1 if isinstance(residual, PointToPlane) else None
-    count = weights.sum() if axes else (weights[:, None, None] * J[..., :3].square()).sum()
+    count = (weights[:, None, None] * J[..., :3].square()).sum()  # of unit directions that are measured
     noise = 5.0 * (residuals.square().sum() / count + 1e-6)
     expected = torch.tensor([0.04] * 3 + [math.radians(0.2)] * 3, dtype=torch.float64)
     held = torch.cat([torch.zeros(6, 6, dtype=torch.float64), (noise.sqrt() / expected).diag()], dim=1)
