@@ -78,10 +78,10 @@ class Backend:
             scan.phases[scan.queries],
         )
 
-    def best_hypothesis(
+    def try_out(
         self, scan: SampledScan, T_previous_new: Float[Tensor, "h 4 4"], T_world_previous: Tensor
-    ) -> Tensor:
-        """The guess, among several, from which a few points of the scan come to agree with the map best.
+    ) -> tuple[Float[Tensor, "h 4 4"], Float[Tensor, "h"]]:
+        """Where a few points of the scan go from each of several guesses, and how well they come to agree with the map.
 
         The points are not deskewed: the guesses differ by more than the motion within a scan.
         """
@@ -99,8 +99,8 @@ class Backend:
             self.hypothesis_distance_m,
             self.normals(scan.points, few),
         )
-        best = self._agreement(scan.points, few, result.T_world_lidar).argmax()
-        return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar[best]))
+        motions = se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar))
+        return motions, self._agreement(scan.points, few, result.T_world_lidar)
 
     def agreement(self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:
         """How well a motion agrees with the map, see `GaussNewton.agreement`."""

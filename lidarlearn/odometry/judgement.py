@@ -39,9 +39,10 @@ class Judgement:
         max_deviation_m: largest plausible change of motion from one scan to the next [m]; 0.5 m at 10 Hz is an
             acceleration of 50 m/s^2.
         max_deviation_deg: largest plausible change of rotation from one scan to the next [deg].
-        min_gain: an implausible change of motion is believed only if the scan agrees so much better with it than with
-            a plausible one, see `GaussNewton.agreement`: by 0.2 after a turn of 20 deg. Registered to the
-            previous scan alone, standing still agrees by up to 0.02 better than driving on a motorway.
+        min_gain: among several motions, an implausible change of motion is believed only if the scan agrees so much
+            better with it than with any plausible one, see `GaussNewton.agreement`: by 0.2 after a turn of 20 deg.
+            Registered to the previous scan alone, standing still agrees by up to 0.02 better than driving on a
+            motorway.
         restart_after: with so many scans in a row without an acceptable registration the map is begun anew.
     """
 

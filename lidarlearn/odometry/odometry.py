@@ -14,12 +14,12 @@ from lidarlearn.odometry.backend import Backend
 from lidarlearn.odometry.health import Health, Status
 from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
 from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
-from lidarlearn.odometry.judgement import Judgement, motion_difference
+from lidarlearn.odometry.judgement import Judgement, MotionDifference, motion_difference
 from lidarlearn.odometry.sampling import SampledScan
 from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, as_scan
 from lidarlearn.registration.result import RegistrationResult
 
-_SEARCHED_M = 0.5  # how far off a motion may be that was found among several
+_SEARCHED_M = 0.1  # how far off a motion may be that was found among several, with few points
 
 
 class Odometry(ScanByScan):
@@ -116,7 +116,7 @@ class Odometry(ScanByScan):
     def _advance(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> Health:
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
         attempt = self._register(scan, T_previous_new, source)
-        if self._recovery and source != "start" and self._is_doubtful(attempt):
+        if self._recovery and source != "start" and self._is_doubtful(attempt, T_previous_new):
             attempt = self._try_others(scan, T_previous_new, attempt)
         if not self._judgement.accepts(attempt.result):
             return self._coast(attempt.health)
@@ -136,9 +136,12 @@ class Odometry(ScanByScan):
             attempt = other
         return replace(attempt, health=replace(attempt.health, status="recovered"))
 
-    def _is_doubtful(self, attempt: "_Attempt") -> bool:
+    def _is_doubtful(self, attempt: "_Attempt", T_guess: Tensor) -> bool:
         fits_as_before = attempt.result.fit.item() >= self._judgement.min_fit_share * max(self._fits, default=0.0)
-        return attempt.health.implausible or not fits_as_before or not self._judgement.accepts(attempt.result)
+        # Where the map says too little the guess remains.
+        leap_remains = attempt.health.degenerate and self._leaps(motion_difference(self._motion, T_guess))
+        is_odd = attempt.health.implausible or leap_remains or not fits_as_before
+        return is_odd or not self._judgement.accepts(attempt.result)
 
     def _register(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> "_Attempt":
         is_searched = source in ("start", "recovery")
@@ -150,8 +153,14 @@ class Odometry(ScanByScan):
     def _agreement(self, scan: SampledScan, attempt: "_Attempt") -> float:
         return self._backend.agreement(scan, attempt.motion, self._T_world_lidar)
 
-    def _search(self, scan: SampledScan, T_previous_new: Float[Tensor, "h 4 4"]) -> Tensor:
-        return self._backend.best_hypothesis(scan, T_previous_new, self._T_world_lidar)
+    def _search(self, scan: SampledScan, guesses: Float[Tensor, "h 4 4"]) -> Tensor:
+        """The best of the motions that several guesses lead to; one that leaps, if clearly better than any other."""
+        motions, agreements = self._backend.try_out(scan, guesses, self._T_world_lidar)
+        leaps = torch.tensor([self._leaps(motion_difference(self._motion, motion)) for motion in motions])
+        return motions[(agreements - self._judgement.min_gain * leaps).argmax()]
+
+    def _leaps(self, deviation: MotionDifference) -> bool:
+        return self._first is None and not self._judgement.is_plausible(deviation)
 
     def _coast(self, health: Health) -> Health:
         """Move as before; after too many scans without a registration, begin a new map."""
@@ -193,7 +202,7 @@ class Odometry(ScanByScan):
             weakest_direction=tuple(result.weakest_direction.tolist()),
             deviation_m=deviation.distance_m,
             deviation_deg=deviation.angle_deg,
-            implausible=self._first is None and not self._judgement.is_plausible(deviation),
+            implausible=self._leaps(deviation),
         )
 
     def _unregistered(self, scan: SampledScan, source: str) -> Health:
