@@ -39,8 +39,8 @@ class Judgement:
         max_deviation_m: largest plausible change of motion from one scan to the next [m]; 0.5 m at 10 Hz is an
             acceleration of 50 m/s^2.
         max_deviation_deg: largest plausible change of rotation from one scan to the next [deg].
-        min_gain: among several motions, an implausible change of motion is believed only if the scan agrees so much
-            better with it than with any plausible one, see `GaussNewton.agreement`: by 0.2 after a turn of 20 deg.
+        min_gain: an implausible change of motion is believed only if the scan agrees so much better with it than with
+            none, see `GaussNewton.agreement`: by 0.2 after a turn of 20 deg; a smaller change with less, in proportion.
             Registered to the previous scan alone, standing still agrees by up to 0.02 better than driving on a
             motorway.
         restart_after: with so many scans in a row without an acceptable registration the map is begun anew.
@@ -62,7 +62,14 @@ class Judgement:
 
     def is_plausible(self, deviation: MotionDifference) -> bool:
         """Whether a motion that differs so much from the one before it can follow it."""
-        return deviation.distance_m <= self.max_deviation_m and deviation.angle_deg <= self.max_deviation_deg
+        return self._surprise(deviation) <= 1
+
+    def credibility(self, agreement: float, deviation: MotionDifference) -> float:
+        """By what motions are compared: how well the scan agrees with one, less what it takes to believe it."""
+        return agreement - self.min_gain * min(self._surprise(deviation), 1.0)
+
+    def _surprise(self, deviation: MotionDifference) -> float:
+        return max(deviation.distance_m / self.max_deviation_m, deviation.angle_deg / self.max_deviation_deg)
 
 
 def motion_difference(T_a: Float[Tensor, "4 4"], T_b: Float[Tensor, "4 4"]) -> MotionDifference:

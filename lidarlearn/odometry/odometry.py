@@ -14,7 +14,7 @@ from lidarlearn.odometry.backend import Backend
 from lidarlearn.odometry.health import Health, Status
 from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
 from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
-from lidarlearn.odometry.judgement import Judgement, MotionDifference, motion_difference
+from lidarlearn.odometry.judgement import Judgement, motion_difference
 from lidarlearn.odometry.sampling import SampledScan
 from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, as_scan
 from lidarlearn.registration.result import RegistrationResult
@@ -116,8 +116,8 @@ class Odometry(ScanByScan):
     def _advance(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> Health:
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
         attempt = self._register(scan, T_previous_new, source)
-        if self._recovery and source != "start" and self._is_doubtful(attempt, T_previous_new):
-            attempt = self._try_others(scan, T_previous_new, attempt)
+        if self._recovery and source != "start" and self._is_doubtful(attempt):
+            attempt = self._try_others(scan, attempt)
         if not self._judgement.accepts(attempt.result):
             return self._coast(attempt.health)
         self._fits.append(attempt.result.fit.item())
@@ -128,18 +128,23 @@ class Odometry(ScanByScan):
         self._coasting = 0
         return attempt.health
 
-    def _try_others(self, scan: SampledScan, T_guess: Tensor, attempt: "_Attempt") -> "_Attempt":
-        """The better of a doubtful registration and the best from other motions; one that leaps, clearly the better."""
-        other = self._register(scan, self._search(scan, surprise_motions(T_guess, self._motion)), "recovery")
-        needed = self._judgement.min_gain * (other.health.implausible - attempt.health.implausible)
-        if self._agreement(scan, other) - self._agreement(scan, attempt) > needed:
-            attempt = other
-        return replace(attempt, health=replace(attempt.health, status="recovered"))
+    def _try_others(self, scan: SampledScan, doubtful: "_Attempt") -> "_Attempt":
+        """The most credible of a registration in doubt, one from the last motion and one from the best of many."""
+        attempts = [doubtful]
+        if not torch.equal(doubtful.T_guess, self._motion):
+            attempts.append(self._register(scan, self._motion, "recovery"))
+        if self._is_doubtful(attempts[-1]):
+            guesses = surprise_motions(doubtful.T_guess, self._motion)
+            attempts.append(self._register(scan, self._search(scan, guesses), "recovery"))
+        best = max(attempts, key=lambda attempt: self._credibility(scan, attempt))
+        return replace(best, health=replace(best.health, status="recovered"))
 
-    def _is_doubtful(self, attempt: "_Attempt", T_guess: Tensor) -> bool:
+    def _is_doubtful(self, attempt: "_Attempt") -> bool:
         fits_as_before = attempt.result.fit.item() >= self._judgement.min_fit_share * max(self._fits, default=0.0)
         # Where the map says too little the guess remains.
-        leap_remains = attempt.health.degenerate and self._leaps(motion_difference(self._motion, T_guess))
+        leap_remains = attempt.health.degenerate and not self._judgement.is_plausible(
+            motion_difference(self._motion, attempt.T_guess)
+        )
         is_odd = attempt.health.implausible or leap_remains or not fits_as_before
         return is_odd or not self._judgement.accepts(attempt.result)
 
@@ -148,19 +153,20 @@ class Odometry(ScanByScan):
         surprise_m = _SEARCHED_M if is_searched else max(self._surprises_m, default=math.inf)
         result = self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m)
         motion = se3.orthonormalize(torch.linalg.solve(self._T_world_lidar, result.T_world_lidar))
-        return _Attempt(result, motion, self._assess(scan, result, motion, source))
+        return _Attempt(T_previous_new, result, motion, self._assess(scan, result, motion, source))
 
-    def _agreement(self, scan: SampledScan, attempt: "_Attempt") -> float:
-        return self._backend.agreement(scan, attempt.motion, self._T_world_lidar)
+    def _credibility(self, scan: SampledScan, attempt: "_Attempt") -> float:
+        agreement = self._backend.agreement(scan, attempt.motion, self._T_world_lidar)
+        return self._judgement.credibility(agreement, motion_difference(self._motion, attempt.motion))
 
     def _search(self, scan: SampledScan, guesses: Float[Tensor, "h 4 4"]) -> Tensor:
-        """The best of the motions that several guesses lead to; one that leaps, if clearly better than any other."""
+        """The most credible of the motions that several guesses lead to."""
         motions, agreements = self._backend.try_out(scan, guesses, self._T_world_lidar)
-        leaps = torch.tensor([self._leaps(motion_difference(self._motion, motion)) for motion in motions])
-        return motions[(agreements - self._judgement.min_gain * leaps).argmax()]
-
-    def _leaps(self, deviation: MotionDifference) -> bool:
-        return self._first is None and not self._judgement.is_plausible(deviation)
+        if self._first is not None:
+            return motions[agreements.argmax()]
+        deviations = [motion_difference(self._motion, motion) for motion in motions]
+        credibilities = map(self._judgement.credibility, agreements.tolist(), deviations)
+        return motions[torch.tensor(list(credibilities)).argmax()]
 
     def _coast(self, health: Health) -> Health:
         """Move as before; after too many scans without a registration, begin a new map."""
@@ -202,7 +208,7 @@ class Odometry(ScanByScan):
             weakest_direction=tuple(result.weakest_direction.tolist()),
             deviation_m=deviation.distance_m,
             deviation_deg=deviation.angle_deg,
-            implausible=self._leaps(deviation),
+            implausible=self._first is None and not self._judgement.is_plausible(deviation),
         )
 
     def _unregistered(self, scan: SampledScan, source: str) -> Health:
@@ -214,8 +220,9 @@ class Odometry(ScanByScan):
 
 @dataclass(frozen=True)
 class _Attempt:
-    """A registration, the motion that it means, and what is to be thought of it."""
+    """A registration from a guess, the motion that it means, and what is to be thought of it."""
 
+    T_guess: Float[Tensor, "4 4"]
     result: RegistrationResult
     motion: Float[Tensor, "4 4"]
     health: Health
