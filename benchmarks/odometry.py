@@ -40,7 +40,7 @@ class Row:
     method: str = column("method")
     scans_per_second: float = column("scans/s")
     ratio_to_kiss_icp: float = column("of KISS-ICP's")
-    ape_rmse_m: float = column("APE RMSE [m]")
+    ape_rmse_m: float | None = column("APE RMSE [m]")
     mean_rpe_cm: float = column("mean RPE [cm]")
     gpu_memory_mib: float | None = column("GPU memory [MiB]")
 
@@ -90,8 +90,7 @@ def measure(options: report.Options) -> list[Row]:
             pace = statistics.median(k / s for k, s in zip(seconds["kiss_icp"], seconds[method], strict=True))
             rpe_cm = 100 * float(relative_errors(poses[method], true).translation.mean())
             per_second = len(points) / statistics.median(seconds[method])
-            ape_m = float(ape_rmse(poses[method], true))
-            rows.append(Row(name, method, per_second, pace, ape_m, rpe_cm, memory[method]))
+            rows.append(Row(name, method, per_second, pace, ape_rmse(poses[method], true), rpe_cm, memory[method]))
     wrong = [f"{r.method} on {r.drive}" for r in rows if r.method in METHODS and not r.mean_rpe_cm < _LARGEST_RPE_CM]
     if wrong:
         raise report.BenchmarkError(f"mean RPE of {_LARGEST_RPE_CM} cm or more: {', '.join(wrong)}", rows)

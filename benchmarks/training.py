@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from lightning.fabric.utilities import move_data_to_device
+from torch.optim import Optimizer
 
 from benchmarks import report
 from benchmarks.report import column
@@ -58,7 +60,7 @@ def _measure(options: report.Options, folder: str, frames: int, height: int, wid
     datamodule.setup()
     datamodule.keep_maps_on(options.device)
     module = build_module(config, datamodule, "benchmark").to(options.device).train()
-    optimizer = module.configure_optimizers()["optimizer"]  # type: ignore[index, call-overload]
+    optimizer: Optimizer = module.configure_optimizers()["optimizer"]  # type: ignore[assignment, call-overload, index]
 
     def autocast() -> AbstractContextManager[None]:
         return torch.autocast(options.device.type, torch.bfloat16, enabled=options.device.type == "cuda")
@@ -68,7 +70,7 @@ def _measure(options: report.Options, folder: str, frames: int, height: int, wid
             yield from datamodule.train_dataloader()
 
     def to_device(batch: Pair) -> Pair:
-        moved = {key: value.to(options.device, non_blocking=True) for key, value in batch.items()}  # type: ignore[attr-defined]
+        moved = move_data_to_device(batch, options.device)
         return datamodule.completed(moved, augmented=True)
 
     def step(batch: Pair, bare: bool = False) -> None:

@@ -19,8 +19,13 @@ _PADDING = Padding()
 class TrainedNetwork(Protocol):
     """What is needed of a network: its image, and the relative pose it sees in two of them."""
 
-    projection: SphericalProjection
-    device: torch.device
+    @property
+    def projection(self) -> SphericalProjection:
+        """The image."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network is."""
 
     def relative_pose(self, reference: Float[Tensor, "b 3 h w"], target: Float[Tensor, "b 3 h w"]) -> Tensor:
         """`T_ref_new` (b, 4, 4), float64."""
