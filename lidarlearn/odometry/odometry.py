@@ -19,7 +19,7 @@ from lidarlearn.odometry.sampling import SampledScan
 from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, as_scan
 from lidarlearn.registration.result import RegistrationResult
 
-_SEARCHED_M = 0.1  # how far off a motion may be that was found among several, with few points
+_NOT_FAR_M = 0.1  # how far off a motion may be that was found among several, or is the last one
 
 
 class Odometry(ScanByScan):
@@ -140,17 +140,17 @@ class Odometry(ScanByScan):
         return replace(best, health=replace(best.health, status="recovered"))
 
     def _is_doubtful(self, attempt: "_Attempt") -> bool:
-        fits_as_before = attempt.result.fit.item() >= self._judgement.min_fit_share * max(self._fits, default=0.0)
-        # Where the map says too little the guess remains.
-        leap_remains = attempt.health.degenerate and not self._judgement.is_plausible(
-            motion_difference(self._motion, attempt.T_guess)
-        )
-        is_odd = attempt.health.implausible or leap_remains or not fits_as_before
-        return is_odd or not self._judgement.accepts(attempt.result)
+        if attempt.health.implausible or not self._judgement.accepts(attempt.result):
+            return True
+        if attempt.result.fit.item() < self._judgement.min_fit_share * max(self._fits, default=0.0):
+            return True
+        # Where the map says too little, what was guessed remains.
+        guessed = motion_difference(self._motion, attempt.T_guess)
+        return attempt.health.degenerate and not self._judgement.is_plausible(guessed)
 
     def _register(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> "_Attempt":
         is_searched = source in ("start", "recovery")
-        surprise_m = _SEARCHED_M if is_searched else max(self._surprises_m, default=math.inf)
+        surprise_m = _NOT_FAR_M if is_searched else max(self._surprises_m, default=math.inf)
         result = self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m)
         motion = se3.orthonormalize(torch.linalg.solve(self._T_world_lidar, result.T_world_lidar))
         return _Attempt(T_previous_new, result, motion, self._assess(scan, result, motion, source))

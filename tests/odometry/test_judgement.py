@@ -1,0 +1,37 @@
+import math
+
+import pytest
+import torch
+
+from lidarlearn.geometry import se3
+from lidarlearn.odometry.judgement import Judgement, MotionDifference, motion_difference
+
+JUDGEMENT = Judgement(max_deviation_m=0.5, max_deviation_deg=8.0, min_gain=0.1)
+
+
+def test_a_motion_follows_another_if_both_its_changes_are_small():
+    assert JUDGEMENT.is_plausible(MotionDifference(0.5, 8.0))
+    assert not JUDGEMENT.is_plausible(MotionDifference(0.51, 0.0))
+    assert not JUDGEMENT.is_plausible(MotionDifference(0.0, 8.1))
+
+
+@pytest.mark.parametrize(
+    ("deviation", "price"),
+    [
+        (MotionDifference(0.0, 0.0), 0.0),
+        (MotionDifference(0.25, 0.0), 0.05),
+        (MotionDifference(0.05, 6.0), 0.075),  # the larger of the two changes counts
+        (MotionDifference(0.5, 0.0), 0.1),
+        (MotionDifference(2.2, 30.0), 0.1),  # a scan may have been lost, or the sensor been turned by hand
+    ],
+)
+def test_a_change_of_motion_must_agree_better_in_proportion_and_by_no_more_than_the_gain(deviation, price):
+    assert JUDGEMENT.credibility(0.6, deviation) == pytest.approx(0.6 - price)
+
+
+def test_the_difference_of_motions_is_the_motion_between_them():
+    T_a = se3.exp(torch.tensor([1.2, 0.1, 0.0, 0.01, -0.02, 0.3], dtype=torch.float64))
+    T_a_b = se3.exp(torch.tensor([0.3, 0.0, 0.4, 0.0, 0.0, math.radians(5)], dtype=torch.float64))
+    difference = motion_difference(T_a, T_a @ T_a_b)
+    assert difference.distance_m == pytest.approx(T_a_b[:3, 3].norm().item())
+    assert difference.angle_deg == pytest.approx(5.0)
