@@ -31,7 +31,7 @@ _DPI = 120
 _TRUTH = "#4d4d4d"
 # Okabe and Ito's palette, told apart with any colour vision; the line style changes when it is used up.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-_STYLES = ("-", "--", ":")
+_STYLES = ("-", "--", ":", "-.")
 _KMH = 3.6
 
 
