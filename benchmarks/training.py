@@ -16,7 +16,6 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from lightning.fabric.utilities import move_data_to_device
-from torch.optim import Optimizer
 
 from benchmarks import report
 from benchmarks.report import column
@@ -60,7 +59,7 @@ def _measure(options: report.Options, folder: str, frames: int, height: int, wid
     datamodule.setup()
     datamodule.keep_maps_on(options.device)
     module = build_module(config, datamodule, "benchmark").to(options.device).train()
-    optimizer: Optimizer = module.configure_optimizers()["optimizer"]  # type: ignore[assignment, call-overload, index]
+    optimizer = module.configure_optimizers()["optimizer"]
 
     def autocast() -> AbstractContextManager[None]:
         return torch.autocast(options.device.type, torch.bfloat16, enabled=options.device.type == "cuda")

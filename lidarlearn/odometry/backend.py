@@ -78,12 +78,20 @@ class Backend:
             scan.phases[scan.queries],
         )
 
-    def try_out(
+    def register_hypotheses(
         self, scan: SampledScan, T_previous_new: Float[Tensor, "h 4 4"], T_world_previous: Tensor
     ) -> tuple[Float[Tensor, "h 4 4"], Float[Tensor, "h"]]:
         """Where a few points of the scan go from each of several guesses, and how well they come to agree with the map.
 
         The points are not deskewed: the guesses differ by more than the motion within a scan.
+
+        Args:
+            scan: the new scan.
+            T_previous_new: the guesses.
+            T_world_previous: pose of the previous scan.
+
+        Returns:
+            A motion from each guess, and its agreement, see `GaussNewton.agreement`.
         """
         few = scan.queries[:: max(math.ceil(len(scan.queries) / self.hypothesis_points), 1)]
         quick = replace(

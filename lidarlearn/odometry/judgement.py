@@ -40,7 +40,8 @@ class Judgement:
             acceleration of 50 m/s^2.
         max_deviation_deg: largest plausible change of rotation from one scan to the next [deg].
         min_gain: an implausible change of motion is believed only if the scan agrees so much better with it than with
-            none, see `GaussNewton.agreement`: by 0.2 after a turn of 20 deg; a smaller change with less, in proportion.
+            no change, see `GaussNewton.agreement`: by 0.2 after a turn of 20 deg; a smaller change with less, in
+            proportion.
             Registered to the previous scan alone, standing still agrees by up to 0.02 better than driving on a
             motorway.
         restart_after: with so many scans in a row without an acceptable registration the map is begun anew.
@@ -56,6 +57,13 @@ class Judgement:
     min_gain: float = 0.1
     restart_after: int = 5
 
+    def __post_init__(self) -> None:
+        if not (self.max_deviation_m > 0 and self.max_deviation_deg > 0):
+            raise ValueError(
+                "judgement: max_deviation_m and max_deviation_deg must be above 0, got "
+                f"max_deviation_m={self.max_deviation_m}, max_deviation_deg={self.max_deviation_deg}"
+            )
+
     def accepts(self, result: RegistrationResult) -> bool:
         """Whether enough of the scan fits the map."""
         return result.overlap.item() >= self.min_overlap and result.inlier_share.item() >= self.min_inlier_share
@@ -65,7 +73,12 @@ class Judgement:
         return self._surprise(deviation) <= 1
 
     def credibility(self, agreement: float, deviation: MotionDifference) -> float:
-        """By what motions are compared: how well the scan agrees with one, less what it takes to believe it."""
+        """By what motions are compared: how well the scan agrees with one, less what it takes to believe it.
+
+        Args:
+            agreement: see `GaussNewton.agreement`, 0..1.
+            deviation: how far it is from the motion before it.
+        """
         return agreement - self.min_gain * min(self._surprise(deviation), 1.0)
 
     def _surprise(self, deviation: MotionDifference) -> float:

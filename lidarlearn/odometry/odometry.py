@@ -161,7 +161,7 @@ class Odometry(ScanByScan):
 
     def _search(self, scan: SampledScan, guesses: Float[Tensor, "h 4 4"]) -> Tensor:
         """The most credible of the motions that several guesses lead to."""
-        motions, agreements = self._backend.try_out(scan, guesses, self._T_world_lidar)
+        motions, agreements = self._backend.register_hypotheses(scan, guesses, self._T_world_lidar)
         if self._first is not None:
             return motions[agreements.argmax()]
         deviations = [motion_difference(self._motion, motion) for motion in motions]

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from lightning.pytorch import LightningModule
-from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -143,7 +143,7 @@ class PoseNetModule(LightningModule):
         """The held-out sequences, in the order of the validation loaders."""
         return self.trainer.datamodule.val_sequences  # type: ignore[attr-defined]
 
-    def configure_optimizers(self) -> OptimizerLRScheduler:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """Optimizer over the network and the loss (which may learn its weights), and the schedule of its rate.
 
         A schedule that asks for `total_steps` goes by steps, others by epochs.

@@ -29,6 +29,12 @@ def test_a_change_of_motion_must_agree_better_in_proportion_and_by_no_more_than_
     assert JUDGEMENT.credibility(0.6, deviation) == pytest.approx(0.6 - price)
 
 
+@pytest.mark.parametrize("setting", ["max_deviation_m", "max_deviation_deg"])
+def test_changes_of_motion_that_are_plausible_have_a_size(setting):
+    with pytest.raises(ValueError, match=f"must be above 0.*{setting}=0"):
+        Judgement(**{setting: 0.0})
+
+
 def test_the_difference_of_motions_is_the_motion_between_them():
     T_a = se3.exp(torch.tensor([1.2, 0.1, 0.0, 0.01, -0.02, 0.3], dtype=torch.float64))
     T_a_b = se3.exp(torch.tensor([0.3, 0.0, 0.4, 0.0, 0.0, math.radians(5)], dtype=torch.float64))
