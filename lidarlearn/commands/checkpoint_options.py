@@ -21,6 +21,9 @@ from lidarlearn.training.checkpoints import CheckpointError, load_checkpoint
 from lidarlearn.training.parts import require_trusted
 
 OPTION = "checkpoint"
+RECIPE = f"recipe={OPTION}"  # comes after the defaults, and before experiments and the command line
+GLOBAL = "# @package _global_\n"
+_CHECKPOINT = re.compile(r"\+{0,2}ckpt=")
 _SEARCH_PATH = "hydra.searchpath"
 _CLUSTER = "hydra/launcher=submitit_slurm"
 
@@ -35,7 +38,7 @@ def given_checkpoint(arguments: Sequence[str], instead_of_several: str) -> Path 
     Raises:
         UserError: there are several, for the jobs of a multirun.
     """
-    given = next((argument for argument in reversed(arguments) if re.match(r"\+{0,2}ckpt=", argument)), "ckpt=null")
+    given = next((argument for argument in reversed(arguments) if _CHECKPOINT.match(argument)), "ckpt=null")
     try:
         path = OverridesParser.create().parse_override(given).value()
     except OverrideParseException:
@@ -48,17 +51,31 @@ def given_checkpoint(arguments: Sequence[str], instead_of_several: str) -> Path 
 def add_data(arguments: list[str], folder: Path) -> None:
     """Let `ckpt=...` choose the data it was trained on, unless `data=...` or an experiment does.
 
-    Where the data lie is no matter of the checkpoint: `data.root` is that of this machine.
-
     Args:
         arguments: the command line; it is completed.
         folder: an empty one for the options.
     """
-    if any(argument.startswith(("data=", "experiment=")) for argument in arguments):
+    if is_data_given(arguments) or RECIPE in arguments:
         return
     path = given_checkpoint(arguments, "one at a time; to evaluate several, add data=...")
-    if path is None:
-        return
+    if path is not None:
+        write_data(path, folder)
+        write_option(folder, "recipe", {"defaults": [{"override /data": OPTION}]}, header=GLOBAL)
+        add_to_search_path(arguments, folder, RECIPE)
+
+
+def is_data_given(arguments: Sequence[str]) -> bool:
+    """Whether a command line chooses its data."""
+    return any(argument.startswith("data=") for argument in arguments)
+
+
+def write_data(path: Path, folder: Path) -> None:
+    """Make the data of a checkpoint an option. Where they lie is that of this machine: `data.root`.
+
+    Raises:
+        CheckpointError: it names no data set.
+        UntrustedTargetError: they are of a foreign class.
+    """
     trained_on = load_checkpoint(path)["hyper_parameters"]["trained_on"]
     name, data = str(trained_on["data_name"]), trained_on["data"]
     require_trusted(data, DataSet)
@@ -66,16 +83,15 @@ def add_data(arguments: list[str], folder: Path) -> None:
         raise CheckpointError(path, f"was trained on data={name}, which is no name of a data set.")
     settings = {key: value for key, value in data.items() if key != "root"}
     write_option(folder, "data", {"defaults": [f"{name}@_here_", "_self_"], **settings})
-    arguments += [f"data={OPTION}"]
-    add_to_search_path(arguments, folder)
 
 
-def add_to_search_path(arguments: list[str], folder: Path) -> None:
+def add_to_search_path(arguments: list[str], folder: Path, *options: str) -> None:
     """Let Hydra find the options in a folder, beside those where the command line has it search already.
 
     Args:
-        arguments: the command line; it is completed.
+        arguments: the command line; it is completed beside `ckpt=...`, because flags may stand behind all overrides.
         folder: of this machine alone.
+        options: what else to add.
 
     Raises:
         UserError: the jobs run on machines that do not see the folder.
@@ -94,7 +110,9 @@ def add_to_search_path(arguments: list[str], folder: Path) -> None:
             return  # composing the configuration will say what is wrong
         places += places_given
     arguments[:] = [argument for argument in arguments if argument not in given]
-    arguments += [f"{_SEARCH_PATH}=[{','.join(quoted(str(place)) for place in dict.fromkeys(places))}]"]
+    beside = max(i for i, argument in enumerate(arguments) if _CHECKPOINT.match(argument))
+    search_path = f"{_SEARCH_PATH}=[{','.join(quoted(str(place)) for place in dict.fromkeys(places))}]"
+    arguments[beside:beside] = [*options, search_path]
 
 
 def quoted(text: str) -> str:

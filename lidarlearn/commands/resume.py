@@ -3,22 +3,29 @@
 from pathlib import Path
 from typing import Any
 
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.utilities import rank_zero_warn
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from lidarlearn.commands.checkpoint_options import (
+    GLOBAL,
     OPTION,
-    add_data,
+    RECIPE,
     add_to_search_path,
     given_checkpoint,
+    is_data_given,
+    write_data,
     write_option,
 )
 from lidarlearn.errors import UserError
 from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.module import PoseNetModule
 from lidarlearn.training.parts import require_plain, require_trusted
+from lidarlearn.training.progress import time_left_s
 
 _FIXED = {"model": nn.Module, "loss": nn.Module, "optimizer": Optimizer, "scheduler": LRScheduler}
 
@@ -26,10 +33,9 @@ _FIXED = {"model": nn.Module, "loss": nn.Module, "optimizer": Optimizer, "schedu
 _OF_DATAMODULE = ("batch_size", "augmentation")
 _OF_TRAINER = (
     "max_epochs", "min_epochs", "max_steps", "min_steps", "precision", "accumulate_grad_batches", "gradient_clip_val",
-    "gradient_clip_algorithm", "limit_train_batches", "limit_val_batches", "overfit_batches", "val_check_interval",
+    "gradient_clip_algorithm", "limit_train_batches", "limit_val_batches", "overfit_batches",
     "check_val_every_n_epoch", "sync_batchnorm",
 )  # fmt: skip
-_RECIPE = f"recipe={OPTION}"  # comes after the defaults, and before experiments and the command line
 
 
 def settings_to_keep(config: DictConfig) -> dict[str, Any]:
@@ -54,21 +60,25 @@ def add_settings(arguments: list[str], folder: Path) -> None:
         folder: an empty one for the options.
     """
     path = given_checkpoint(arguments, "one at a time")
-    if path is None or _RECIPE in arguments:  # the further processes of a training inherit all
+    if path is None or RECIPE in arguments:  # the further processes of a training inherit all
         return
-    add_data(arguments, folder)
+    chosen = ["model", "loss", "optimizer"]
+    if not is_data_given(arguments):
+        write_data(path, folder)
+        chosen.append("data")
     checkpoint = load_checkpoint(path)
     parts = checkpoint["hyper_parameters"]
     trained_on = parts["trained_on"]
     settings = trained_on.get("settings", {})
     for part, kind in {**_FIXED, "module": PoseNetModule}.items():
         require_trusted({"_target_": checkpoint["module"]} if part == "module" else parts[part], kind)
-    require_plain(settings)
+    of_module = {key: value for key, value in parts.items() if key not in (*_FIXED, "trained_on")}
+    require_plain({**settings, **of_module})
     name, schedule = settings.get("scheduler", OPTION), dict(parts["scheduler"])
     of_projection = {key: trained_on["projection"][key] for key in ("height", "width")}
     recipe = {
-        "defaults": [*({f"override /{part}": OPTION} for part in ("model", "loss", "optimizer")), "_self_"],
-        "module": {"_target_": checkpoint["module"]},
+        "defaults": [*({f"override /{part}": OPTION} for part in chosen), "_self_"],
+        "module": {"_target_": checkpoint["module"], **of_module},
         "datamodule": {**of_projection, **_only(_OF_DATAMODULE, settings.get("datamodule", {}))},
         "trainer": _only(_OF_TRAINER, settings.get("trainer", {})),
         "scheduler": name,
@@ -80,13 +90,18 @@ def add_settings(arguments: list[str], folder: Path) -> None:
         schedule["milestones"] = "${lr_halving_epochs}"  # by which the command line knows them
     for part in ("model", "loss", "optimizer"):
         write_option(folder, part, parts[part])
-    write_option(folder, "recipe", recipe, header="# @package _global_\n")
-    arguments += [_RECIPE, "~recipe/for_data"]
-    add_to_search_path(arguments, folder)
+    write_option(folder, "recipe", recipe, header=GLOBAL)
+    add_to_search_path(arguments, folder, RECIPE, "~recipe/for_data")
 
 
-def require_resumable(path: Path, module: PoseNetModule, max_epochs: int | None, max_steps: int = -1) -> None:
-    """Raise a `UserError` where a training cannot go on from a checkpoint with this configuration."""
+def require_resumable(path: Path, module: PoseNetModule, trainer: Trainer) -> None:
+    """Raise a `UserError` where a training cannot go on from a checkpoint, and warn where it goes on elsewhere.
+
+    Args:
+        path: the checkpoint.
+        module: of the training that is to go on, as its trainer.
+        trainer: whose limits count from the very first start.
+    """
     checkpoint = load_checkpoint(path)
     for part in _FIXED:
         was, now = checkpoint["hyper_parameters"][part], module.hparams[part]
@@ -98,13 +113,26 @@ def require_resumable(path: Path, module: PoseNetModule, max_epochs: int | None,
                 f"  change: leave the settings of the {part} to the checkpoint, or train anew, without ckpt"
             )
     for what, done, most in (
-        ("epochs", checkpoint["epoch"] + 1, max_epochs),
-        ("steps", checkpoint["global_step"], max_steps),
+        ("epochs", checkpoint["epoch"] + 1, trainer.max_epochs),
+        ("steps", checkpoint["global_step"], trainer.max_steps),
     ):
         if most is not None and 0 <= most <= done:
             raise UserError(
                 f"ckpt={path} has already seen {done} of {most} {what}\n  change: trainer.max_{what}={2 * done}"
             )
+    clock = checkpoint["callbacks"].get(Timer.__qualname__, {}).get("time_elapsed", {}).get("train", 0.0)
+    left = time_left_s(trainer)
+    if left is not None and left <= clock:
+        raise UserError(
+            f"ckpt={path} has already been trained for {clock:.0f} s, which is all of trainer.max_time\n"
+            "  change: trainer.max_time, which counts from the first start"
+        )
+    batches = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
+    if not batches["is_last_batch"]:
+        rank_zero_warn(
+            f"ckpt={path} was stopped within epoch {checkpoint['epoch'] + 1}, after {batches['current']['completed']} "
+            "batches: training goes on with the next epoch, and the others of this one are left out"
+        )
 
 
 def _only(keys: tuple[str, ...], settings: dict[str, Any]) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def train(config: DictConfig, data_name: str) -> Path:
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     module = build_module(config, datamodule, data_name)
     if config.ckpt is not None:
-        require_resumable(Path(config.ckpt), module, config.trainer.max_epochs, config.trainer.max_steps)
+        require_resumable(Path(config.ckpt), module, trainer)
     if trainer.is_global_zero:
         write_run_description(run_folder, config)
     trainer.fit(module, datamodule=datamodule, ckpt_path=config.ckpt)
@@ -68,18 +68,21 @@ def train(config: DictConfig, data_name: str) -> Path:
     return best if best.exists() else best.with_name("last.ckpt")
 
 
-def evaluate_command(checkpoint: Path, overrides: Sequence[str] = ()) -> str:
+def evaluate_command(checkpoint: Path, overrides: Sequence[str] = (), config_folder: str | None = None) -> str:
     """The command that evaluates a checkpoint, as it can be pasted into a shell.
 
     Args:
         checkpoint: the file.
         overrides: of its training; where the data lie is told anew, since a checkpoint does not say.
+        config_folder: of the user's own options, from which its data may come.
     """
     path = str(checkpoint.relative_to(Path.cwd()) if checkpoint.is_relative_to(Path.cwd()) else checkpoint)
     if not _PLAIN_CHARACTERS.issuperset(path):
         path = quoted(path)  # for Hydra; the shell's quotes come around it
     program = "python evaluate.py" if Path("evaluate.py").is_file() else "lidarlearn-evaluate"
     arguments = [f"ckpt={path}", *(override for override in overrides if override.startswith("data.root="))]
+    if config_folder is not None:
+        arguments += ["--config-dir", config_folder]
     return f"{program} {shlex.join(arguments)}"
 
 
@@ -91,7 +94,9 @@ def _train_and_say_what_next(config: DictConfig) -> None:
 def _say_what_next(checkpoint: Path, config: DictConfig) -> None:
     if checkpoint.exists():
         print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
-        print(f"next:       {evaluate_command(checkpoint, HydraConfig.get().overrides.task)}")
+        hydra = HydraConfig.get()
+        folder = next((place.path for place in hydra.runtime.config_sources if place.provider == "command-line"), None)
+        print(f"next:       {evaluate_command(checkpoint, hydra.overrides.task, folder)}")
 
 
 def _require_workable(config: DictConfig) -> None:
@@ -110,10 +115,16 @@ def _require_workable(config: DictConfig) -> None:
             "a fused optimizer clips no gradients of 16 bits\n  change: optimizer.fused=false"
         )
     by_steps = config.schedulers[config.scheduler].get("total_steps", 0) is None
-    if by_steps and trainer.max_epochs == -1 and trainer.max_steps == -1:
+    if by_steps and trainer.max_epochs in (None, -1) and trainer.max_steps in (None, -1):
         raise UserError(
-            f"scheduler={config.scheduler} goes by the length of the training, and trainer.max_epochs=-1 has no end\n"
+            f"scheduler={config.scheduler} goes by the length of the training, which has no end: "
+            f"trainer.max_epochs={trainer.max_epochs or 'null'}\n"
             "  change: trainer.max_epochs, or scheduler=step or constant"
+        )
+    if str(trainer.val_check_interval) not in ("None", "1.0"):
+        raise UserError(
+            f"trainer.val_check_interval={trainer.val_check_interval}: the best checkpoint is chosen among whole epochs"
+            "\n  change: trainer.check_val_every_n_epoch, or trainer.limit_train_batches for shorter epochs"
         )
     if not trainer.logger and "learning_rate" in config.callbacks:
         raise UserError("trainer.logger=false: nothing takes the learning rate\n  change: add ~callbacks.learning_rate")

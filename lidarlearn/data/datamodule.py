@@ -1,5 +1,6 @@
 """The pairs of a data set's sequences as Lightning wants them."""
 
+import math
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -133,7 +134,9 @@ class OdometryDataModule(LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Pair]:
         """Shuffled pairs of all training sequences; a last, smaller batch is left out."""
-        return self._loader(self._train_pairs, shuffle=True, drop_last=len(self._train_pairs) > self.batch_size)
+        processes = 1 if self.trainer is None else self.trainer.world_size
+        pairs_each = math.ceil(len(self._train_pairs) / processes)  # the sampler fills up
+        return self._loader(self._train_pairs, shuffle=True, drop_last=pairs_each > self.batch_size)
 
     def val_dataloader(self) -> list[DataLoader[Pair]]:
         """One loader per validation sequence, in the order of `val_sequences`."""

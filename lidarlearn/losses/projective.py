@@ -4,13 +4,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.normals import normal_map
 from lidarlearn.geometry.projection import SphericalProjection, activated
 from lidarlearn.losses.result import LossResult
+
+_FIT_RESIDUAL_M = 0.1  # scale of a fit: far below a motion, far above noise
+_FEW = 0.1  # share of the reference's pixels below which those that are used are too few for their fit to be believed
 
 
 class ProjectiveLoss(nn.Module, ABC):
@@ -67,8 +70,9 @@ class ProjectiveLoss(nn.Module, ABC):
         """
         aligned = reproject(se3.from_euler(parameters), target, projection)
         with torch.no_grad():
-            normals = normal_map(reference, self.normal_window, self.max_range_jump, self.max_roughness)
-            used = activated(aligned) & activated(normals)  # which only activated pixels of the reference have
+            normals = self.normals(reference)
+            defined = activated(normals)  # only activated pixels have one
+            used = activated(aligned) & defined
         offsets = aligned - reference
         residuals = (offsets * normals).sum(dim=1)
         squared_distances = (offsets * offsets).sum(dim=1)
@@ -83,8 +87,31 @@ class ProjectiveLoss(nn.Module, ABC):
                 "residual_m": mean_over_used(residuals.detach().abs()),
                 "distance_m": mean_over_used(squared_distances.detach().sqrt()),
                 "activated_share": used.float().mean(),
+                "misfit": misfit(residuals.detach(), used, defined),
             },
         )
+
+    def normals(self, reference: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
+        """Normals of a vertex map, zero where this loss takes them to be undefined."""
+        return normal_map(reference, self.normal_window, self.max_range_jump, self.max_roughness)
+
+
+def misfit(
+    residuals: Float[Tensor, "batch h w"], used: Bool[Tensor, "batch h w"], defined: Bool[Tensor, "batch h w"]
+) -> Float[Tensor, ""]:
+    """How badly scans are aligned, from 0 to 1 without any overlap: what to compare networks by, not to descend.
+
+    The losses fall again where scans are so far apart that hardly a pixel is believed or used. This is what
+    `GaussNewton.agreement` is to a registration: the share of the used pixels that do not fit, and more where they are
+    few.
+
+    Args:
+        residuals: point-to-plane distances [m].
+        used: pixels of the reference with a point of the target.
+        defined: pixels of the reference with a normal.
+    """
+    fit = (used * torch.exp(-((residuals / _FIT_RESIDUAL_M) ** 2))).sum(dim=(1, 2))
+    return (1 - fit / (used.sum(dim=(1, 2)) + _FEW * defined.sum(dim=(1, 2))).clamp(min=1)).mean()
 
 
 def reproject(

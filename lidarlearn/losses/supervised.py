@@ -14,12 +14,12 @@ class SupervisedLoss(nn.Module):
     For a given mean squared error m the best s is -ln m: the network learns the precision of either half, and each
     contributes about one whatever its unit. The price is a loss without lower bound, which falls by ln(1/m) for ever
     as the errors do (its sign means nothing, only its course). On a pair learned by heart s would grow until e^s
-    overflows, hence the largest precision.
+    overflows, hence the largest precision; in training s is put back to it, from where it can fall again.
 
     Args:
         initial_s1: s1 at the start; 0 suits errors of a metre.
         initial_s2: s2 at the start; 6 suits errors of 0.05 rad.
-        max_s: s counts as this where it has grown larger; 14 stands for errors of 1 mm and 1 mrad.
+        max_s: s grows no larger; 14 stands for errors of 1 mm and 1 mrad.
 
     Source: Dellenbach et al. 2021, III-B "Supervised training", after LO-Net (Li et al., CVPR 2019).
     """
@@ -40,9 +40,12 @@ class SupervisedLoss(nn.Module):
         errors = se3.to_euler(T_ref_new).to(parameters.dtype) - parameters
         translation = errors[:, :3].square().sum(dim=1).mean()
         rotation = errors[:, 3:].square().sum(dim=1).mean()
-        s1, s2 = self.s1.clamp(max=self.max_s), self.s2.clamp(max=self.max_s)
+        if self.training:
+            with torch.no_grad():
+                self.s1.clamp_(max=self.max_s)
+                self.s2.clamp_(max=self.max_s)
         return LossResult(
-            loss=translation * s1.exp() + rotation * s2.exp() - (s1 + s2),
+            loss=translation * self.s1.exp() + rotation * self.s2.exp() - (self.s1 + self.s2),
             parts={
                 "translation_squared_m2": translation.detach(),
                 "rotation_squared_rad2": rotation.detach(),

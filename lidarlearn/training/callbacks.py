@@ -12,7 +12,7 @@ from torch.utils.tensorboard import SummaryWriter
 from lidarlearn.evaluation.plots import trajectory_figure
 from lidarlearn.geometry.normals import normal_map
 from lidarlearn.geometry.projection import activated
-from lidarlearn.losses.projective import reproject
+from lidarlearn.losses.projective import ProjectiveLoss, reproject
 from lidarlearn.training.module import PoseNetModule
 
 _IMAGE_ROWS = 192  # images are enlarged to about so many rows: beams are few and pages are high
@@ -35,6 +35,8 @@ class EventLogger(TensorBoardLogger):
 
 class InputImages(Callback):
     """Images of the first held-out pair: range and normals of its reference, and how well the target falls onto it.
+
+    Normals are those that the loss uses, where it uses any.
 
     Args:
         every_n_epochs: how often to draw them.
@@ -63,7 +65,8 @@ class InputImages(Callback):
         assert isinstance(pl_module, PoseNetModule)
         reference, target = batch["reference"][:1], batch["target"][:1]
         aligned = reproject(pl_module.relative_pose(reference, target), target, pl_module.projection)
-        normals = normal_map(reference)
+        loss = pl_module.loss
+        normals = loss.normals(reference) if isinstance(loss, ProjectiveLoss) else normal_map(reference)
         images = {
             f"vertex map, range 0 to {self.max_range_m:g} m": range_image(reference[0], self.max_range_m),
             "normal map": normal_image(normals[0]),

@@ -56,7 +56,7 @@ class PoseNetModule(LightningModule):
         self.loss = build(loss, nn.Module)
         self.predicted_drives = []
         self._predictions: list[list[tuple[Tensor, Tensor]]] = []
-        self._val_losses: list[Tensor] = []
+        self._val_losses: list[LossResult] = []
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]  # one argument is enough, the file holds the rest
@@ -82,6 +82,11 @@ class PoseNetModule(LightningModule):
         """Go on in the stream of random numbers, so that a resumed training sees the batches of an unbroken one."""
         if "random_state" in checkpoint:
             torch.set_rng_state(checkpoint["random_state"].cpu())
+
+    def on_train_start(self) -> None:
+        """Let each process have a chance of its own: all begin alike, with one seed or one checkpoint."""
+        if self.global_rank > 0:
+            torch.manual_seed(int(torch.randint(2**62, ())) + self.global_rank)
 
     @abstractmethod
     def compute_loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
@@ -118,23 +123,25 @@ class PoseNetModule(LightningModule):
     def validation_step(self, batch: Pair, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Predict the motions of a stretch of one sequence."""
         parameters = self(batch["reference"], batch["target"])
-        self._val_losses.append(self._loss(parameters, batch).loss.detach())
+        self._val_losses.append(self._loss(parameters, batch))
         self._predictions[dataloader_idx].append((torch.as_tensor(batch["index"]), parameters.detach()))
 
     def on_validation_epoch_end(self) -> None:
         """Chain the predictions into drives, score them, and log the error by which the best checkpoint is chosen.
 
         `val/error` is the average translation error [%]; the mean relative translation error [m] where the drives are
-        under 100 m; the loss where they have no ground truth.
+        under 100 m; where they have no ground truth, how badly scans are aligned: see `losses.projective.misfit`.
         """
         self.predicted_drives = [
             predicted_drive(sequence, *self._gathered(predictions))
             for sequence, predictions in zip(self.val_sequences, self._predictions, strict=True)
         ]
         means = mean_errors([e for e in map(drive_errors, self.predicted_drives) if e is not None])
-        loss = self._of_all(torch.stack(self._val_losses)).mean() if self._val_losses else torch.tensor(0.0)
-        error = means.get("avg_translation_error_percent", means.get("mean_relative_translation_error_m", float(loss)))
-        self.log_dict({f"val/{name}": value for name, value in means.items()}, rank_zero_only=True)
+        loss = self._mean_of_all([result.loss for result in self._val_losses])
+        misfit = self._mean_of_all([result.parts.get("misfit", result.loss) for result in self._val_losses])
+        error = means.get("avg_translation_error_percent", means.get("mean_relative_translation_error_m", misfit))
+        told = means or {"misfit": misfit}
+        self.log_dict({f"val/{name}": value for name, value in told.items()}, rank_zero_only=True)
         # every process needs the error, and has the same one: it decides about checkpoints together
         self.log_dict({"val/loss": loss, "val/error": error})
 
@@ -168,6 +175,9 @@ class PoseNetModule(LightningModule):
         indices = self._of_all(torch.cat([index for index, _ in predictions]))
         parameters = self._of_all(torch.cat([values for _, values in predictions]))
         return indices.reshape(-1), parameters.reshape(-1, 6)
+
+    def _mean_of_all(self, values: list[Tensor]) -> float:
+        return float(self._of_all(torch.stack(values)).mean()) if values else 0.0
 
     def _of_all(self, values: Tensor) -> Tensor:
         """The values of all processes, stacked where there are several; the sampler gives each equally many."""

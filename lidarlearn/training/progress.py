@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.callbacks.progress import ProgressBar
 from torch import Tensor
 
@@ -29,6 +30,8 @@ class ProgressLines(ProgressBar):
         self._loss = torch.tensor(float("nan"))
         self._epoch_started = self._fit_started = self._last_shown = 0.0
         self._first_epoch = 0
+        self._share = 0.0  # of the epoch's batches
+        self._is_validated = False
 
     def disable(self) -> None:
         """Show nothing, as Lightning asks all processes but the first to."""
@@ -45,6 +48,7 @@ class ProgressLines(ProgressBar):
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the epoch's clock."""
+        self._share, self._is_validated = 0.0, False
         self._epoch_started = self._last_shown = time.monotonic()
         self._loss = torch.tensor(float("nan"))
 
@@ -54,33 +58,47 @@ class ProgressLines(ProgressBar):
         """Move the bar."""
         # a number only where it is shown: to ask for it is to wait for the device
         loss = (outputs["loss"] if isinstance(outputs, dict) else outputs).detach()
+        loss = loss * trainer.accumulate_grad_batches  # by which Lightning has divided it
+        self._share = (batch_idx + 1) / max(1, trainer.num_training_batches)
         self._loss = loss if batch_idx == 0 else 0.95 * self._loss + 0.05 * loss
         terminal = sys.stdout.isatty()
         ends = batch_idx + 1 >= trainer.num_training_batches and not terminal  # the epoch's own line follows
         if not ends and time.monotonic() - self._last_shown >= (0.1 if terminal else self.seconds_between_lines):
             self._last_shown = time.monotonic()
-            share = (batch_idx + 1) / max(1, trainer.num_training_batches)
-            self._show(
-                f"{self._head(trainer, share)}  loss {float(self._loss):.4g}  {self._left(trainer, share)}", terminal
-            )
+            self._show(f"{self._head(trainer)}  loss {float(self._loss):.4g}  {self._left(trainer)}", terminal)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Errors are of this epoch."""
+        self._is_validated = True
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Leave a line with the epoch's mean loss and, if it was validated, its error."""
         metrics = trainer.callback_metrics
         loss = float(metrics.get("train/loss_epoch", self._loss))
         took = _duration(time.monotonic() - self._epoch_started)
-        parts = [self._head(trainer, 1.0), f"loss {loss:.4g}", *_errors(metrics), took, self._left(trainer, 1.0)]
+        errors = _errors(metrics) if self._is_validated else []
+        parts = [self._head(trainer), f"loss {loss:.4g}", *errors, took, self._left(trainer)]
         self._show("  ".join(part for part in parts if part), in_place=False)
 
-    def _head(self, trainer: Trainer, share: float) -> str:
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say which limit ended the training before its last epoch."""
+        within = "" if self._share >= 1 else " within an epoch"
+        left = time_left_s(trainer)
+        if left is not None and left <= 0:
+            self._show(f"trainer.max_time is reached{within}", in_place=False)
+        elif 0 < trainer.max_steps <= trainer.global_step:
+            self._show(f"trainer.max_steps={trainer.max_steps} is reached{within}", in_place=False)
+
+    def _head(self, trainer: Trainer) -> str:
+        share = self._share
         filled = round(_BAR * min(share, 1.0))
         last = trainer.max_epochs if trainer.max_epochs and trainer.max_epochs > 0 else "?"
         bar = "#" * filled + "-" * (_BAR - filled)
         return f"epoch {trainer.current_epoch + 1:>{len(str(last))}}/{last} [{bar}] {100 * min(share, 1.0):3.0f} %"
 
-    def _left(self, trainer: Trainer, share: float) -> str:
+    def _left(self, trainer: Trainer) -> str:
         """Time left, by the mean pace of this training."""
-        done = trainer.current_epoch - self._first_epoch + share
+        done = trainer.current_epoch - self._first_epoch + self._share
         if not trainer.max_epochs or trainer.max_epochs < 0 or done <= 0:
             return ""
         left = (time.monotonic() - self._fit_started) / done * (trainer.max_epochs - self._first_epoch - done)
@@ -92,12 +110,19 @@ class ProgressLines(ProgressBar):
             print(start + text, end=end, flush=True)
 
 
+def time_left_s(trainer: Trainer) -> float | None:
+    """Seconds of `trainer.max_time` that are left, None without such a limit."""
+    timers = (callback for callback in trainer.callbacks if isinstance(callback, Timer))  # type: ignore[attr-defined]
+    return min((left for timer in timers if (left := timer.time_remaining()) is not None), default=None)
+
+
 def _errors(metrics: dict[str, Tensor]) -> list[str]:
     """The validation errors that say most, with their units."""
     shown = {
         "val/avg_translation_error_percent": "avg translation error {:.2f} %",
         "val/mean_relative_translation_error_percent": "relative translation error {:.1f} % of motion",
         "val/mean_relative_translation_error_m": "= {:.3f} m",
+        "val/misfit": "misfit {:.3f}",
     }
     return [form.format(float(metrics[name])) for name, form in shown.items() if name in metrics]
 

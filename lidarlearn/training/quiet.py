@@ -8,7 +8,7 @@ _NOT_FOR_THE_USER = (
     r".*does not have many workers.*",  # maps are mapped into memory: workers hardly help, and cores may be few
     r".*is smaller than the logging interval.*",  # small data sets are legitimate; epoch values are logged anyway
     r".*Checkpoint directory .* exists and is not empty.*",  # resuming into the same run folder is legitimate
-    r".*You're resuming from a checkpoint that ended before the epoch ended.*",  # checkpoints are of whole epochs
+    r".*You're resuming from a checkpoint that ended before the epoch ended.*",  # told where true
     r".*LeafSpec.*deprecated.*",  # Lightning's own use of torch
     r".*Total length of `list` across ranks is zero.*",  # one may go without validation
     r".*It is recommended to use `self.log\('val/.*",  # every process has them from all: `PoseNetModule` gathers

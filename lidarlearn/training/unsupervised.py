@@ -15,7 +15,7 @@ from lidarlearn.losses.result import LossResult
 from lidarlearn.training.module import PoseNetModule
 
 LEAST_ACTIVATED_SHARE = 0.02
-"""Share of used pixels below which the first batch of a training makes it warn; HDL-64 scans have about 0.4."""
+"""Share of used pixels below which a training warns; HDL-64 scans have about 0.4."""
 
 
 class UnsupervisedModule(PoseNetModule):
@@ -47,6 +47,19 @@ class UnsupervisedModule(PoseNetModule):
             raise ValueError(f"compile_loss is true, false or auto, got {compile_loss!r}")
         self.compile_loss = compile_loss
         self._training_loss: Callable[..., LossResult] | None = None
+        self._has_warned = False
+
+    def on_train_epoch_end(self) -> None:
+        """Warn where the estimates have come so far off that scans no longer overlap: no loss would show it."""
+        share = self.trainer.callback_metrics.get("train/activated_share_epoch", torch.tensor(1.0))
+        if share < LEAST_ACTIVATED_SHARE and not self._has_warned:
+            self._has_warned = True
+            rate = self.trainer.optimizers[0].defaults["lr"]
+            rank_zero_warn(
+                f"in epoch {self.current_epoch + 1} only {100 * float(share):.1f} % of the pixels held a point of both "
+                "scans and a normal: the estimated motions are so far off that nothing can be learned from them any "
+                f"more, however small the loss\n  change: a lower optimizer.lr than {rate:g}"
+            )
 
     def compute_loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
         """Point-to-plane alignment of the target with the reference."""
@@ -58,6 +71,7 @@ class UnsupervisedModule(PoseNetModule):
             self._training_loss = compiled(self.loss, *inputs) if self._shall_compile(parameters) else self.loss.forward
         result = self._training_loss(*inputs)
         if is_first and self.global_step == 0 and result.parts["activated_share"] < LEAST_ACTIVATED_SHARE:
+            self._has_warned = True
             p = self.projection
             rank_zero_warn(
                 f"only {100 * float(result.parts['activated_share']):.1f} % of the {p.height}x{p.width} pixels hold a "

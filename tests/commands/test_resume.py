@@ -8,6 +8,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from lightning.pytorch import Trainer
 from omegaconf import OmegaConf
 
 from lidarlearn.commands import evaluate, train
@@ -66,6 +67,34 @@ def test_a_training_goes_on_as_it_was_configured(checkpoint, tmp_path, monkeypat
     assert config.model.rotation_scale == 0.2
     assert (config.scheduler, config.schedulers.step.milestones) == ("step", [1])
     assert (config.trainer.max_epochs, config.trainer.limit_train_batches) == (2, 2)
+
+
+def test_settings_of_the_module_are_kept_and_can_be_changed(checkpoint, tmp_path):
+    content = torch.load(checkpoint, weights_only=True)
+    content["hyper_parameters"]["compile_loss"] = False
+    torch.save(content, tmp_path / "eager.ckpt")
+    assert composed(tmp_path / "o", tmp_path / "eager.ckpt").module.compile_loss is False
+    assert composed(tmp_path / "o", tmp_path / "eager.ckpt", "module.compile_loss=auto").module.compile_loss == "auto"
+
+
+@pytest.mark.parametrize("program", ["train", "evaluate"])
+def test_an_experiment_that_chooses_no_data_leaves_them_to_the_checkpoint(checkpoint, tmp_path, program):
+    place = tmp_path / "mine" / "experiment" / "seeded.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text("# @package _global_\nseed: 3\n")
+    overrides = [f"hydra.searchpath=['file://{tmp_path}/mine']", "experiment=seeded"]
+    config = composed(tmp_path / "o", checkpoint, *overrides, program=program)
+    assert (config.seed, config.data.max_frames) == (3, FRAMES)
+    chosen = "network/simulated_mapping" if program == "train" else "paper/kitti_sim"
+    config = composed(tmp_path / "o", checkpoint, f"experiment={chosen}", program=program)
+    assert config.data["_target_"].endswith("SimulatedDataSet")
+
+
+@pytest.mark.parametrize(("program", "add"), [("train", add_settings), ("evaluate", add_data)])
+def test_flags_may_stand_behind_the_overrides(checkpoint, tmp_path, program, add):
+    arguments = [f"{program}.py", f"ckpt={checkpoint}", "seed=0,1", "-m", "--config-dir", "mine"]
+    add(arguments, tmp_path / "o")
+    assert arguments[-3:] == ["-m", "--config-dir", "mine"] and "recipe=checkpoint" in arguments[1:-3]
 
 
 def test_a_schedule_without_milestones_goes_on_too(checkpoint, tmp_path):
@@ -134,7 +163,7 @@ def test_what_cannot_change_says_so(checkpoint, tmp_path, override, words):
     config = composed(tmp_path / "o", checkpoint, override)
     module = train.build_module(config, instantiate(config.datamodule), "folder")
     with pytest.raises(UserError, match=words):
-        require_resumable(checkpoint, module, config.trainer.max_epochs, config.trainer.max_steps)
+        require_resumable(checkpoint, module, Trainer(accelerator="cpu", max_epochs=config.trainer.max_epochs))
 
 
 def test_a_finished_training_is_prolonged_by_nothing_but_more_epochs(checkpoint, scans, tmp_path):
@@ -144,6 +173,24 @@ def test_a_finished_training_is_prolonged_by_nothing_but_more_epochs(checkpoint,
     assert rest["train/loss_step"] == whole["train/loss_step"][4:]  # the very same batches
     told = torch.load(again, weights_only=True)["hyper_parameters"]["trained_on"]
     assert told["data_name"] == "folder" and "root" not in told["data"]
+
+
+@pytest.mark.slow
+def test_a_training_that_was_stopped_within_an_epoch_says_what_is_left_out(scans, tmp_path, capsys):
+    last = run(tmp_path / "run", scans, *RUN, "trainer.max_steps=1")
+    out = capsys.readouterr().out
+    assert "trainer.max_steps=1 is reached within an epoch" in out and "100 %" not in out
+    with pytest.warns(UserWarning, match="stopped within epoch 1, after 1 batches"):
+        run(tmp_path / "again", scans, f"ckpt={last}", "trainer.max_steps=-1")
+
+
+@pytest.mark.slow
+def test_no_time_is_left(scans, tmp_path, capsys):
+    last = run(tmp_path / "run", scans, *RUN[:-2], "trainer.max_epochs=-1", "trainer.max_time=00:00:00:01")
+    assert "trainer.max_time is reached" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        run(tmp_path / "again", scans, f"ckpt={last}", "trainer.max_time=00:00:00:01")
+    assert "all of trainer.max_time" in capsys.readouterr().err
 
 
 def test_data_of_a_checkpoint_lie_where_they_do_on_this_machine(checkpoint, tmp_path, monkeypatch):

@@ -98,6 +98,17 @@ def test_a_later_process_takes_the_checkpoints_of_the_first_for_its_own(tmp_path
         train.train(config, "boxes")
 
 
+def test_the_command_that_is_printed_finds_the_options_of_the_user(tmp_path, monkeypatch, capsys):
+    (tmp_path / "best.ckpt").touch()
+    (tmp_path / "my configs").mkdir()
+    monkeypatch.setattr(train, "train", lambda *_: tmp_path / "best.ckpt")
+    monkeypatch.setattr(
+        sys, "argv", ["train.py", f"hydra.run.dir={tmp_path}/run", "--config-dir", f"{tmp_path}/my configs"]
+    )
+    train.main()
+    assert f"--config-dir '{tmp_path}/my configs'" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("rank", [0, 1])
 def test_the_first_process_alone_says_what_is_next(tmp_path, monkeypatch, capsys, rank):
     (tmp_path / "best.ckpt").touch()

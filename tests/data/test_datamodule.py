@@ -1,6 +1,7 @@
 """The datamodule: which pairs reach the network, and how."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -30,6 +31,13 @@ def test_training_sees_every_pair_of_the_training_sequences_once_an_epoch(tmp_pa
     batches = list(module.train_dataloader())
     assert [len(b["index"]) for b in batches] == [4, 4, 4, 4]
     assert sorted(torch.cat([b["index"] for b in batches]).tolist()) == sorted([*range(8), *range(8)])
+
+
+def test_a_few_pairs_shared_by_two_processes_make_a_batch_of_each(tmp_path):
+    module = make(tmp_path, BoxDrives(frames=7, train_sequences=("0",)))
+    assert len(module.train_dataloader()) == 1  # of four, two are left over
+    module.trainer = SimpleNamespace(world_size=2)
+    assert not module.train_dataloader().drop_last  # of three each
 
 
 def test_training_pairs_are_shuffled(tmp_path):

@@ -41,6 +41,15 @@ def test_the_truth_is_better_than_any_way_off_it(loss, direction, sign, pair):
     assert loss(truth, *pair, FINE).loss < 0.8 * loss(off, *pair, FINE).loss
 
 
+@pytest.mark.parametrize("direction", [0, 1])
+def test_the_misfit_grows_with_the_distance_and_ends_at_one(direction, pair):
+    def misfit(off_m):
+        return LOSSES[1](TRUTH.float() + off_m * torch.eye(6)[direction], *pair, FINE).parts["misfit"].item()
+
+    values = [misfit(off_m) for off_m in (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)]
+    assert values == sorted(values) and 0 < values[0] < 0.2 and values[-1] > 0.99
+
+
 @pytest.mark.parametrize("loss", LOSSES[:2])
 def test_descent_from_no_motion_finds_the_truth(loss, pair):
     parameters = torch.zeros(1, 6, requires_grad=True)
@@ -88,7 +97,7 @@ def test_without_any_overlap_loss_and_gradient_are_zero(loss, far_off, pair):
     parameters = torch.tensor([[0.0, 0, far_off, 0, 0, 0]], requires_grad=True)
     result = loss(parameters, pair[0], target, FINE)
     result.loss.backward()
-    assert result.loss == 0 and result.parts["activated_share"] == 0
+    assert result.loss == 0 and result.parts["activated_share"] == 0 and result.parts["misfit"] == 1
     assert (parameters.grad == 0).all()
 
 

@@ -49,11 +49,21 @@ def test_the_best_weights_are_the_precisions():
     assert loss.s2.item() == pytest.approx(-math.log(result.parts["rotation_squared_rad2"].item()), abs=0.02)
 
 
-def test_weights_stop_growing_where_nothing_is_left_to_learn():
+def test_weights_stop_growing_where_nothing_is_left_to_learn_and_fall_again_where_something_is():
     truth = motions(4)
-    loss = SupervisedLoss(initial_s1=20.0, initial_s2=20.0, max_s=14.0)
-    estimate = truth.float().requires_grad_()
-    result = loss(estimate, se3.from_euler(truth))
-    result.loss.backward()
-    assert result.loss.item() == pytest.approx(-28.0, abs=0.01)
-    assert loss.s1.grad == 0 and loss.s2.grad == 0
+    loss = SupervisedLoss(initial_s1=20.0, initial_s2=13.9, max_s=14.0)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=0.05)
+
+    def step(estimate):
+        optimizer.zero_grad()
+        result = loss(estimate.float(), se3.from_euler(truth))
+        result.loss.backward()
+        optimizer.step()
+        return result.loss.item()
+
+    values = [step(truth) for _ in range(20)]
+    assert values[-1] == pytest.approx(-28.0, abs=0.01)
+    assert max(loss.s1.item(), loss.s2.item()) <= 14.0 + 0.06  # until the next step puts it back
+    for _ in range(200):
+        step(truth + 0.05)
+    assert max(loss.s1.item(), loss.s2.item()) < 11

@@ -203,12 +203,13 @@ def test_two_runs_from_one_seed_are_the_same(tmp_path):
 
 
 @pytest.mark.slow
-def test_without_ground_truth_the_loss_chooses_the_best(tmp_path):
+def test_without_ground_truth_the_fit_of_the_scans_chooses_the_best(tmp_path):
     config = configured(tmp_path / "run", "trainer.max_epochs=1", frames=9, without_truth=["0", "2"])
     best = train(config, data_name="boxes")
     scalars = curves(tmp_path / "run")
     assert best.name == "best.ckpt"
-    assert scalars["val/error"] == scalars["val/loss"]
+    assert scalars["val/error"] == scalars["val/misfit"]
+    assert 0 < scalars["val/error"][0][1] < 1
     assert "val/mean_relative_translation_error_m" not in scalars
 
 
@@ -231,6 +232,18 @@ def test_a_part_of_the_validation_is_scored_as_far_as_it_goes(tmp_path):
     )  # fmt: skip
     train(config, data_name="boxes")
     assert curves(tmp_path / "run")["val/error"][0][1] > 0
+
+
+@pytest.mark.slow
+def test_a_training_that_has_lost_all_overlap_is_told(tmp_path):
+    """The loss is nought then, and the misfit as large as can be."""
+    config = configured(
+        tmp_path / "run", "trainer.max_epochs=4", "optimizer.lr=0.3", frames=17, without_truth=["0", "2"]
+    )
+    with pytest.warns(UserWarning, match=r"so far off that(.|\n)*optimizer\.lr than 0\.3"):
+        train(config, data_name="boxes")
+    scalars = curves(tmp_path / "run")
+    assert scalars["val/loss"][-1][1] < 1e-3 and scalars["val/error"][-1][1] > 0.99
 
 
 @pytest.mark.slow

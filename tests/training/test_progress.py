@@ -20,6 +20,7 @@ def trainer():
     }
     stand_in = create_autospec(Trainer, instance=True)
     stand_in.current_epoch = 0
+    stand_in.accumulate_grad_batches = 1
     stand_in.max_epochs, stand_in.num_training_batches, stand_in.callback_metrics = 2, 4, metrics
     return stand_in
 
@@ -32,6 +33,8 @@ def run(bar, trainer):
         bar.on_train_epoch_start(trainer, module)
         for i in range(4):
             bar.on_train_batch_end(trainer, module, {"loss": torch.tensor(0.5)}, None, i)
+        if epoch == 0:
+            bar.on_validation_end(trainer, module)
         bar.on_train_epoch_end(trainer, module)
 
 
@@ -42,6 +45,7 @@ def test_in_a_log_file_one_line_an_epoch(trainer, capsys):
     assert re.match(r"epoch 1/2 \[#{20}\] 100 %  loss 0\.125", lines[0])
     assert "3.46 %" in lines[0] and "0.079 m" in lines[0]
     assert lines[1].startswith("epoch 2/2") and "left" not in lines[1]
+    assert "3.46 %" not in lines[1]  # not validated in this epoch
 
 
 def test_a_long_epoch_writes_lines_within(trainer, capsys):
@@ -50,6 +54,12 @@ def test_a_long_epoch_writes_lines_within(trainer, capsys):
     shares = [int(re.search(r"(\d+) %", line)[1]) for line in lines]
     assert shares == [25, 50, 75, 100, 25, 50, 75, 100]
     assert all("loss 0.5" in line for line in lines[:3])
+
+
+def test_the_loss_of_accumulated_batches_is_that_of_one(trainer, capsys):
+    trainer.accumulate_grad_batches = 4  # Lightning hands on a fourth of each
+    run(ProgressLines(seconds_between_lines=0.0), trainer)
+    assert "loss 2 " in capsys.readouterr().out.splitlines()[0]
 
 
 def test_the_device_is_waited_for_only_where_a_loss_is_shown(trainer):

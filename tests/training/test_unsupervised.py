@@ -100,6 +100,18 @@ def test_where_compiling_fails_training_goes_on_without(monkeypatch, way):
     trained.compute_loss(parameters, batch())  # and says so once
 
 
+@pytest.mark.parametrize("rank", [0, 1, 2])
+def test_each_process_of_a_training_has_a_chance_of_its_own(monkeypatch, rank):
+    """All begin with that of the seed or the checkpoint; the first one keeps it, as if it were alone."""
+    drawn = []
+    for own in (0, rank):
+        monkeypatch.setattr(UnsupervisedModule, "global_rank", own)
+        torch.manual_seed(3)
+        module().on_train_start()
+        drawn.append(torch.rand(4))
+    assert torch.equal(*drawn) == (rank == 0)
+
+
 def test_another_word_than_auto_is_refused():
     with pytest.raises(ValueError, match="true, false or auto, got 'always'"):
         module(compile_loss="always")
