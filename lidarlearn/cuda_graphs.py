@@ -170,7 +170,7 @@ class Recordings:
         shapes = [tuple(value.shape) for value in inputs]
         if padding is not None:
             shapes[0] = (padding.length(len(inputs[0])), *shapes[0][1:])
-        key = (settings, *shapes, *(value.dtype for value in inputs))
+        key = (settings, device, *shapes, *(value.dtype for value in inputs))
         if key not in self._recordings:
             if len(self._recordings) >= self._MOST:
                 self.forget()

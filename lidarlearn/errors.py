@@ -1,4 +1,4 @@
-"""The base of every error that a user can mend."""
+"""The base of every error that a user can mend, and a check of settings."""
 
 
 class UserError(Exception):
@@ -6,3 +6,10 @@ class UserError(Exception):
 
     The entry points print the message alone and exit with 1; everything else is a defect and keeps its stack trace.
     """
+
+
+def require_positive(part: str, **settings: float | int) -> None:
+    """Raise a ValueError unless all settings of a part are above 0."""
+    wrong = ", ".join(f"{name}={value}" for name, value in settings.items() if not value > 0)
+    if wrong:
+        raise ValueError(f"{part}: {' and '.join(settings)} must be above 0, got {wrong}")

@@ -30,30 +30,37 @@ def voxel_keys(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
     return x.mul_(ny).add_(y).mul_(nz).add_(z)
 
 
-def grid_sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor, "m"]:
+def grid_sample(
+    points: Float[Tensor, "n 3"], voxel_size_m: float, recordings: cuda_graphs.Recordings | None = None
+) -> Int[Tensor, "m"]:
     """Indices of one point of every occupied voxel, drawn by lot, in the order of the voxels.
 
     Deterministic, yet blind to the order of the scan: a spinning LiDAR lists its points beam by beam, and the first
     point of each voxel would stand on the same side of all of them, which a registration follows. In the order of the
     voxels, neighbours in space are neighbours in memory, too, which makes searching among them faster.
 
+    Args:
+        points: the scan [m].
+        voxel_size_m: edge of the voxels [m].
+        recordings: where a GPU records this, for whoever asks for it scan by scan.
+
     Source: Dellenbach et al. 2021, IV-A: 0.4 m for Kd-F2M.
     """
-    if cuda_graphs.are_used_on(points.device):
-        return _grid_sample_on_gpu(points, voxel_size_m)
+    if recordings is not None and cuda_graphs.are_used_on(points.device):
+        return _recorded_grid_sample(points, voxel_size_m, recordings)
     lots = _lots(len(points), points.device)
     _, order, begins = _sorted(voxel_keys(voxel_cells(points, voxel_size_m)).index_select(0, lots))
     return lots[order[begins]]
 
 
-_recordings = cuda_graphs.Recordings()
-
-
-def _grid_sample_on_gpu(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Int[Tensor, "m"]:
+def _recorded_grid_sample(
+    points: Float[Tensor, "n 3"], voxel_size_m: float, recordings: cuda_graphs.Recordings
+) -> Int[Tensor, "m"]:
     """The same, asking only once for a size."""
     as_many_as_lots = cuda_graphs.Padding(to_power_of_two=True)
     sample = functools.partial(_sample, voxel_size_m=voxel_size_m)
-    index, begins = _recordings(sample, points, device=points.device, settings=voxel_size_m, padding=as_many_as_lots)
+    settings = ("grid_sample", voxel_size_m)
+    index, begins = recordings(sample, points, device=points.device, settings=settings, padding=as_many_as_lots)
     return index[begins]
 
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarlearn.errors import require_positive
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.voxels import voxel_cells
 from lidarlearn.odometry.local_map import LocalMap
@@ -18,7 +19,7 @@ from lidarlearn.registration.result import RegistrationResult
 # Enough to compare hypotheses: the best one is registered again.
 _HYPOTHESIS_ITERATIONS = 20
 _HYPOTHESIS_TOLERANCE = 10  # times the registration's
-_NORMAL_VOXEL_M = 0.4  # neighbourhoods for the normals of a new scan, which only generalized ICP needs
+_HYPOTHESIS_ROUNDS = 2  # of deskewing
 
 
 @dataclass
@@ -41,6 +42,10 @@ class Backend:
     max_search_distance_m: float = 3.0
     hypothesis_points: int = 2000
     hypothesis_distance_m: float = 1.5
+
+    def __post_init__(self) -> None:
+        distances = {name: getattr(self, name) for name in ("max_search_distance_m", "hypothesis_distance_m")}
+        require_positive("odometry", hypothesis_points=self.hypothesis_points, **distances)
 
     def register(
         self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor, surprise_m: float
@@ -79,21 +84,39 @@ class Backend:
         )
 
     def register_hypotheses(
-        self, scan: SampledScan, T_previous_new: Float[Tensor, "h 4 4"], T_world_previous: Tensor
+        self, scan: SampledScan, T_previous_new: Float[Tensor, "h 4 4"], T_world_previous: Tensor, deskews: bool = True
     ) -> tuple[Float[Tensor, "h 4 4"], Float[Tensor, "h"]]:
         """Where a few points of the scan go from each of several guesses, and how well they come to agree with the map.
-
-        The points are not deskewed: the guesses differ by more than the motion within a scan.
 
         Args:
             scan: the new scan.
             T_previous_new: the guesses.
             T_world_previous: pose of the previous scan.
+            deskews: whether points that carry times are deskewed by each guess, and once more by the motion that comes
+                out: a scan of a sudden turn fits nowhere as it is.
 
         Returns:
             A motion from each guess, and its agreement, see `GaussNewton.agreement`.
         """
-        few = scan.queries[:: max(math.ceil(len(scan.queries) / self.hypothesis_points), 1)]
+        few = replace(scan, queries=scan.queries[:: max(math.ceil(len(scan.queries) / self.hypothesis_points), 1)])
+        if scan.times is None or not deskews:
+            motions = self._hypotheses(few.points, few.queries, T_previous_new, T_world_previous)
+            return motions, self._agreement(few.points, few.queries, T_world_previous @ motions)
+        motions = T_previous_new
+        for _ in range(_HYPOTHESIS_ROUNDS):
+            motions = torch.stack(
+                [self._hypotheses(few.deskewed(T), few.queries, T, T_world_previous) for T in motions.unbind()]
+            )
+        return motions, torch.tensor([self.agreement(few, T, T_world_previous) for T in motions.unbind()])
+
+    def _hypotheses(
+        self,
+        points: Float[Tensor, "n 3"],
+        chosen: Int[Tensor, "m"],
+        T_previous_new: Float[Tensor, "*batch 4 4"],
+        T_world_previous: Tensor,
+    ) -> Float[Tensor, "*batch 4 4"]:
+        """Motions that some of a scan's points come to from one or several guesses."""
         quick = replace(
             self.registration,
             max_iterations=_HYPOTHESIS_ITERATIONS,
@@ -101,14 +124,13 @@ class Backend:
             rotation_tolerance_deg=_HYPOTHESIS_TOLERANCE * self.registration.rotation_tolerance_deg,
         )
         result = quick.register(
-            scan.points[few],
+            points[chosen],
             self.local_map.association,
             T_world_previous @ T_previous_new,
             self.hypothesis_distance_m,
-            self.normals(scan.points, few),
+            self.normals(points, chosen),
         )
-        motions = se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar))
-        return motions, self._agreement(scan.points, few, result.T_world_lidar)
+        return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar))
 
     def agreement(self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:
         """How well a motion agrees with the map, see `GaussNewton.agreement`."""
@@ -128,7 +150,7 @@ class Backend:
         """Normals of some of a scan's points, from the neighbourhoods among all, where the residual needs them."""
         if not self.registration.residual.needs_normals:
             return None
-        return neighbourhood_normals(points, _NORMAL_VOXEL_M)[chosen]
+        return neighbourhood_normals(points, self.sampling.neighbourhood_m)[chosen]
 
 
 def neighbourhood_normals(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Float[Tensor, "n 3"]:

@@ -27,7 +27,8 @@ class Health:
         skew_m: length of the motion that the compensation of the scan left over, over a scan period [m].
         skew_deg: angle of the same [deg].
         min_information: share of the points that notice a move in the weakest direction.
-        degenerate: whether that is too little, so that the motion in this direction is a prediction.
+        degenerate: whether that is too little for the motion in this direction to be relied on. With less than
+            `registration.min_information` it is a prediction.
         weakest_direction: that direction, a unit vector in the sensor's frame.
         deviation_m: distance between the registered motion and constant velocity [m].
         deviation_deg: angle between the two [deg].

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarlearn.errors import require_positive
 from lidarlearn.registration.result import RegistrationResult
 
 
@@ -58,11 +59,7 @@ class Judgement:
     restart_after: int = 5
 
     def __post_init__(self) -> None:
-        if not (self.max_deviation_m > 0 and self.max_deviation_deg > 0):
-            raise ValueError(
-                "judgement: max_deviation_m and max_deviation_deg must be above 0, got "
-                f"max_deviation_m={self.max_deviation_m}, max_deviation_deg={self.max_deviation_deg}"
-            )
+        require_positive("judgement", max_deviation_m=self.max_deviation_m, max_deviation_deg=self.max_deviation_deg)
 
     def accepts(self, result: RegistrationResult) -> bool:
         """Whether enough of the scan fits the map."""

@@ -16,7 +16,7 @@ from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
 from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
 from lidarlearn.odometry.judgement import Judgement, motion_difference
 from lidarlearn.odometry.sampling import SampledScan
-from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, as_scan
+from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, are_shares_of_a_period, as_scan
 from lidarlearn.registration.result import RegistrationResult
 
 _NOT_FAR_M = 0.1  # how far off a motion may be that was found among several, or is the last one
@@ -27,7 +27,7 @@ class Odometry(ScanByScan):
 
     Args:
         initialization: guesses the motion.
-        backend: samples, registers and keeps the map.
+        backend: samples, registers and keeps the map; what it holds of another drive is forgotten.
         judgement: when a registration is doubted.
         min_range_m: closer returns are dropped: the vehicle itself [m].
         max_range_m: farther returns are dropped [m].
@@ -49,6 +49,7 @@ class Odometry(ScanByScan):
     ) -> None:
         self._initialization = initialization
         self._backend = backend
+        backend.local_map.restart()
         self._judgement = judgement or Judgement()
         self._min_range_m = min_range_m
         self._max_range_m = max_range_m
@@ -78,10 +79,12 @@ class Odometry(ScanByScan):
         else:
             health = self._advance(scan, guess.T_previous_new, guess.source)
         self._frames += 1
-        return Frame(self._T_world_lidar, health)
+        return Frame(self._T_world_lidar.clone(), health)
 
     def _in_range(self, points: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
         kept = in_range(points, self._min_range_m, self._max_range_m)
+        if times is not None:
+            kept = kept[are_shares_of_a_period(times.index_select(0, kept))]
         return points.index_select(0, kept), None if times is None else times.index_select(0, kept)
 
     def _begin(self, scan: SampledScan) -> Health:
@@ -102,7 +105,7 @@ class Odometry(ScanByScan):
         T_previous_new, source = guess.T_previous_new, guess.source
         if self._recovery:
             T_previous_new, source = self._search(scan, start_motions(T_previous_new)), "start"
-        if first.times is not None:
+        if first.times is not None and not self._coasting:  # else the sensor has moved on since
             self._deskew_first(first, scan, T_previous_new, source)
         return self._advance(scan, T_previous_new, source)
 
@@ -161,7 +164,8 @@ class Odometry(ScanByScan):
 
     def _search(self, scan: SampledScan, guesses: Float[Tensor, "h 4 4"]) -> Tensor:
         """The most credible of the motions that several guesses lead to."""
-        motions, agreements = self._backend.register_hypotheses(scan, guesses, self._T_world_lidar)
+        is_map_skewed = self._first is not None  # a compensated scan would not fit one that is not
+        motions, agreements = self._backend.register_hypotheses(scan, guesses, self._T_world_lidar, not is_map_skewed)
         if self._first is not None:
             return motions[agreements.argmax()]
         deviations = [motion_difference(self._motion, motion) for motion in motions]
@@ -192,6 +196,7 @@ class Odometry(ScanByScan):
     def _assess(self, scan: SampledScan, result: RegistrationResult, motion: Tensor, source: str) -> Health:
         deviation = motion_difference(self._motion, motion)
         information = result.information[0].item()
+        least = max(self._judgement.min_information, self._backend.registration.min_information)
         return Health(
             frame=self._frames,
             initialization=source,
@@ -204,7 +209,7 @@ class Odometry(ScanByScan):
             skew_m=result.skew[:3].norm().item(),
             skew_deg=math.degrees(result.skew[3:].norm().item()),
             min_information=information,
-            degenerate=information < self._judgement.min_information,
+            degenerate=information < least,
             weakest_direction=tuple(result.weakest_direction.tolist()),
             deviation_m=deviation.distance_m,
             deviation_deg=deviation.angle_deg,

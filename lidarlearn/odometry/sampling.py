@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarlearn.cuda_graphs import Padding, Recordings
+from lidarlearn.errors import require_positive
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import grid_sample
@@ -103,6 +104,11 @@ class SampledScan:
 class Sampling(ABC):
     """Selects points of a scan."""
 
+    @property
+    def neighbourhood_m(self) -> float:
+        """Edge of the voxels whose points, and those of the voxels around, span a surface [m]."""
+        return _DENSE_MAP_VOXEL_M
+
     @abstractmethod
     def sample(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> SampledScan:
         """The points to use.
@@ -126,13 +132,23 @@ class GridSampling(Sampling):
 
     map_voxel_m: float = 0.4
     query_voxel_m: float | None = None
+    _recordings: Recordings = field(default_factory=Recordings, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        voxels = {"map_voxel_m": self.map_voxel_m, "query_voxel_m": self.query_voxel_m}
+        require_positive("sampling", **{name: size_m for name, size_m in voxels.items() if size_m is not None})
+
+    @property
+    def neighbourhood_m(self) -> float:
+        """No finer than the points are kept."""
+        return max(super().neighbourhood_m, self.map_voxel_m)
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
         """One point of every voxel, drawn by `grid_sample`, in the order of the voxels."""
-        index = grid_sample(points, self.map_voxel_m)
+        index = grid_sample(points, self.map_voxel_m, self._recordings)
         points = points[index]
         if self.query_voxel_m is not None and self.query_voxel_m > self.map_voxel_m:
-            queries = grid_sample(points, self.query_voxel_m).sort().values
+            queries = grid_sample(points, self.query_voxel_m, self._recordings).sort().values
         else:
             queries = torch.arange(len(points), device=points.device)
         return SampledScan(points, None if times is None else times[index], queries)
@@ -152,6 +168,9 @@ class ImageSampling(Sampling):
     projection: SphericalProjection
     max_queries: int = 8000
     _recordings: Recordings = field(default_factory=Recordings, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        require_positive("sampling", max_queries=self.max_queries)
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
         """The nearest points, and an evenly strided subset of them, scattered over rows and columns."""

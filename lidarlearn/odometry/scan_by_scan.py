@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarlearn.geometry import se3
@@ -26,6 +26,8 @@ class Frame:
     health: Health
 
 
+_LATEST = 1.5  # scan periods from the instant of a pose
+
 # Of any number type, on any device, arrays in any order of memory; `as_scan` checks them, for they come from users.
 Points = Tensor | np.ndarray
 Times = Tensor | np.ndarray
@@ -40,11 +42,13 @@ class ScanByScan(ABC):
 
         Args:
             points: the scan (n, 3) [m], in the sensor's frame; may be empty or hold values that are not finite.
-            times: when each point was measured (n,), to compensate the motion within the scan; see
-                `lidarlearn.data.sequence.Scan`. None where there is nothing to compensate.
+            times: when each point was measured (n,), to compensate the motion within the scan: as a share of the scan
+                period, from the instant of the pose, e.g. -0.5 to 0.5; see `lidarlearn.data.sequence.Scan`. Points
+                with other times are left out. None where there is nothing to compensate.
 
         Raises:
-            ValueError: the points are not (n, 3), or there are more or fewer times than points.
+            ValueError: the points are not (n, 3), there are more or fewer times than points, or most of the times are
+                no shares of a scan period.
         """
 
 
@@ -60,7 +64,18 @@ def as_scan(
     times = _as_tensor(times, points.device)
     if times.shape != points.shape[:1]:
         raise ValueError(f"register_scan: times must be ({len(points)},) as the points, but are {tuple(times.shape)}")
+    finite = times[times.isfinite()]
+    if are_shares_of_a_period(finite).sum() * 2 < len(finite):
+        raise ValueError(
+            "register_scan: times must be shares of the scan period, e.g. -0.5 at its beginning and 0.5 at its end, "
+            f"but are {finite.min():g} to {finite.max():g}"
+        )
     return points, times
+
+
+def are_shares_of_a_period(times: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    """Which times can be those of points of one scan, whatever instant of it the pose is that of."""
+    return times.abs() <= _LATEST
 
 
 def _as_tensor(values: Tensor | np.ndarray, device: torch.device | None) -> Tensor:
@@ -93,4 +108,4 @@ class InitializationAlone(ScanByScan):
             self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ self._motion)
         self._frames += 1
         health = Health(self._frames - 1, initialization=guess.source, points=len(points))
-        return Frame(self._T_world_lidar, health)
+        return Frame(self._T_world_lidar.clone(), health)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from lidarlearn.errors import require_positive
 from lidarlearn.geometry import se3
 from lidarlearn.registration.association.base import Association
 from lidarlearn.registration.elasticity import Elasticity
@@ -62,11 +63,10 @@ class GaussNewton:
     elasticity: Elasticity | None = field(default_factory=Elasticity)
 
     def __post_init__(self) -> None:
-        if not (0 < self.narrowing < 1 and self.search_distance_m > 0):
-            raise ValueError(
-                "registration: narrowing must be between 0 and 1 and search_distance_m above 0, got "
-                f"narrowing={self.narrowing}, search_distance_m={self.search_distance_m}"
-            )
+        if not 0 < self.narrowing < 1:
+            raise ValueError(f"registration: narrowing must be between 0 and 1, got narrowing={self.narrowing}")
+        positive = ("search_distance_m", "inlier_residual_m", "fit_residual_m", "max_step_m", "max_step_deg")
+        require_positive("registration", **{name: getattr(self, name) for name in positive})
         if self.max_iterations < 1 or self.coarse_stride < 1:
             raise ValueError(
                 "registration: max_iterations and coarse_stride must be at least 1, got "

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarlearn.errors import require_positive
 from lidarlearn.geometry import se3
 
 
@@ -115,6 +116,9 @@ class GeneralizedIcp(Residual):
 
     epsilon: float = 1e-2
     needs_normals = True
+
+    def __post_init__(self) -> None:
+        require_positive("residual GeneralizedIcp", epsilon=self.epsilon)
 
     def linearize(
         self,

@@ -11,9 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarlearn.errors import require_positive
+
 
 class RobustWeight(ABC):
-    """How much a correspondence counts."""
+    """How much a correspondence counts; what a subclass takes are scales, above 0."""
+
+    def __post_init__(self) -> None:
+        require_positive(f"weight {type(self).__name__}", **vars(self))
 
     @abstractmethod
     def weight(

@@ -7,8 +7,11 @@ import torch
 from torch import Tensor
 
 from lidarlearn.geometry import se3
+from lidarlearn.simulation import scenes
+from lidarlearn.simulation.drive import Drive
 from tests.odometry.odometries import (
     FRAMES,
+    SMALL,
     build,
     kd_at_least,
     motion_errors,
@@ -138,3 +141,51 @@ def test_after_a_long_gap_a_new_map_is_begun_and_said_so(association):
     assert torch.isfinite(poses(frames)).all()
     translations, _ = motion_errors(poses(frames)[10:], street().T_world_lidar[10:])
     assert translations.max() < 0.05
+
+
+@kd_at_least
+def test_points_with_stray_times_are_left_out(association):
+    """In the end each pose is that of scans without these points."""
+    drive = Drive(scenes.street(), poses=scenes.straight_path(7, 1.2), frames=4, sensor=SMALL, motion_distortion=True)
+    whole, spoilt = build(f"cv+{association}_f2m"), build(f"cv+{association}_f2m")
+    for scan in drive:
+        times, strays = scan.times.clone(), torch.arange(len(scan.times)) % 9 == 0
+        times[strays] = torch.tensor([1000.0, math.nan, -math.inf]).repeat(len(times))[: int(strays.sum())]
+        expected = whole.register_scan(scan.points[~strays], scan.times[~strays])
+        torch.testing.assert_close(spoilt.register_scan(scan.points, times).T_world_lidar, expected.T_world_lidar)
+
+
+@pytest.mark.parametrize("unit", [1e5, 60.0])
+def test_times_in_a_unit_of_their_own_are_refused(unit):
+    times = unit * torch.linspace(-0.5, 0.5, len(scans()[0]))
+    with pytest.raises(ValueError, match=rf"shares of the scan period.*are {-unit / 2:g} to {unit / 2:g}"):
+        build("cv+kd_f2m").register_scan(scans()[0], times)
+
+
+@kd_at_least
+@pytest.mark.parametrize("rate_deg", [12.0, pytest.param(20.0, marks=slow)])
+def test_a_sudden_turn_is_followed_though_it_distorts_the_scans(association, rate_deg):
+    """As they are, these scans fit nowhere: within one the sensor turns by as much as from one to the next."""
+    yaws = rate_deg * (torch.arange(16) - AT).clamp(min=0).double()
+    parameters = torch.zeros(16, 6, dtype=torch.float64)
+    parameters[:, 0], parameters[:, 5] = 0.3 * torch.arange(16), yaws.deg2rad()
+    path = torch.from_numpy(scenes.straight_path(1, 0.0))[0] @ se3.from_euler(parameters)
+    drive = Drive(scenes.street(), poses=path.numpy(), frames=12, sensor=SMALL, motion_distortion=True)
+    odometry = build(f"cv+{association}_f2m")
+    frames = [odometry.register_scan(scan.points, scan.times) for scan in drive]
+    translations, angles = motion_errors(poses(frames), drive.T_world_lidar)
+    assert angles.max() < 2.0 and angles[AT + 3 :].max() < 0.15 and translations[AT + 3 :].max() < 0.03
+    assert frames[AT + 1].health.flagged and not any(frame.health.flagged for frame in frames[AT + 4 :])
+
+
+@kd_at_least
+def test_a_map_that_is_begun_anew_stays_where_it_was_begun(association):
+    """Its first scan is compensated once a motion is known: not after another scan, which was empty, has moved on."""
+    drive = Drive(scenes.street(), poses=scenes.straight_path(17, 1.2), frames=13, sensor=SMALL, motion_distortion=True)
+    odometry, nothing = build(f"cv+{association}_f2m"), (torch.zeros(0, 3), torch.zeros(0))
+    frames = [
+        odometry.register_scan(*(nothing if i in (3, 4, 5, 6, 7, 9) else (scan.points, scan.times)))
+        for i, scan in enumerate(drive)
+    ]
+    assert [frame.health.status for frame in frames[8:11]] == ["restarted", "coasted", "ok"]
+    assert (poses(frames) - drive.T_world_lidar)[:, :3, 3].norm(dim=1).max() < 0.1

@@ -6,12 +6,17 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
 from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.odometry import Backend, GridSampling, LocalMap, Odometry
 from lidarlearn.odometry.initialization import ConstantVelocity
+from lidarlearn.odometry.sampling import map_voxel_m
 from lidarlearn.registration.association import KdTree
+from lidarlearn.registration.gauss_newton import GaussNewton
+from lidarlearn.registration.residuals import GeneralizedIcp
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl64
@@ -22,6 +27,7 @@ from tests.odometry.odometries import (
     SENSORS,
     SMALL,
     build,
+    composed,
     kd_at_least,
     motion_errors,
     poses,
@@ -46,6 +52,66 @@ def test_drives_are_followed_from_the_first_frame(association, map_, yaw_step):
     assert [frame.health.status for frame in frames] == ["ok"] * FRAMES
     assert not any(frame.health.flagged for frame in frames)
     assert [frame.health.frame for frame in frames] == list(range(FRAMES))
+
+
+@kd_at_least
+@pytest.mark.parametrize("step_m", [1.4, 2.7])
+def test_a_sensor_that_looks_back_starts_at_speed_too(association, step_m):
+    T_ahead_back = se3.from_euler(torch.tensor([0, 0, 0, 0, 0, math.pi], dtype=torch.float64))
+    drive = street(step=step_m)
+    frames = run(
+        build(f"cv+{association}_f2m"),
+        [se3.transform(se3.inverse(T_ahead_back), points) for points in scans_of(drive)[:4]],
+    )
+    translations, _ = motion_errors(poses(frames), se3.inverse(T_ahead_back) @ drive.T_world_lidar[:4] @ T_ahead_back)
+    assert translations.max() < 0.03
+
+
+def test_a_backend_forgets_another_drive():
+    backend = Backend(GridSampling(), LocalMap(KdTree()))
+    for _ in range(2):
+        frames = run(Odometry(ConstantVelocity(), backend), scans()[:3])
+        translations, _ = motion_errors(poses(frames), street().T_world_lidar[:3])
+        assert translations.max() < 0.02 and torch.equal(poses(frames)[0], se3.identity())
+
+
+@pytest.mark.parametrize("name", ["cv+kd_f2m", "ei"])
+def test_a_pose_belongs_to_whom_it_was_given(name):
+    """Who moves it into a frame of his own moves nothing else."""
+    odometry, untouched = build(name), run(build(name), scans()[:3])
+    for points, expected in zip(scans(), untouched, strict=False):
+        pose = odometry.register_scan(points).T_world_lidar
+        assert torch.equal(pose, expected.T_world_lidar)
+        pose[:3, 3] += 100
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("sampling.map_voxel_m", 0.0),
+        ("registration.max_step_m", 0.0),
+        ("registration.weight.sigma_m", -0.1),
+        ("hypothesis_points", 0),
+    ],
+)
+def test_settings_that_nothing_can_be_done_with_are_refused(setting, value):
+    with pytest.raises(InstantiationException, match=rf"{setting.rpartition('.')[2]}.* must be above 0, got"):
+        build("cv+kd_f2m", f"odometry.kd_f2m.{setting}={value}")
+
+
+def test_a_position_that_is_held_where_it_was_guessed_is_flagged():
+    """However little may be known by the judgement: the registration's own threshold decides what is held."""
+    odometry = build("cv+kd_f2m", "odometry.kd_f2m.registration.min_information=1.0", "pipeline.recovery=false")
+    assert all(frame.health.degenerate for frame in run(odometry, scans()[:4])[1:])
+
+
+@pytest.mark.parametrize("name", ["hdl64", "hdl32", "vlp16"])
+def test_generalized_icp_has_normals_however_few_beams_there_are(name):
+    points = street(sensor=SENSORS[name]).scan(0).points
+    grid = GridSampling(map_voxel_m(instantiate(composed(f"projection@data.projection={name}").data.projection)))
+    backend = Backend(grid, LocalMap(KdTree()), GaussNewton(residual=GeneralizedIcp()))
+    scan = backend.sampling.sample(points)
+    assert (backend.normals(scan.points, scan.queries) != 0).any(dim=1).float().mean() > 0.3
 
 
 @pytest.mark.parametrize("initialization", ["ni", "cv", "ei"])

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarlearn import cuda_graphs
+from lidarlearn.errors import require_positive
 from lidarlearn.geometry.normals import fit_planes
 from lidarlearn.geometry.voxels import grid_sample, voxel_cells
 from lidarlearn.registration.association.sliding_window import SlidingWindow
@@ -43,6 +44,7 @@ class AggregatedPoints(SlidingWindow):
     """
 
     def __init__(self, voxel_size_m: float, device: torch.device) -> None:
+        require_positive("association", voxel_size_m=voxel_size_m)
         self.voxel_size_m = voxel_size_m
         super().__init__(device)
         # One more, for what is no point.
@@ -53,7 +55,7 @@ class AggregatedPoints(SlidingWindow):
         self.forget(frames - 1)
         is_free = self._recorded(self._is_free, points_world)
         points_world = points_world[is_free[: len(points_world)]]
-        points_world = points_world[grid_sample(points_world, self.voxel_size_m)]
+        points_world = points_world[grid_sample(points_world, self.voxel_size_m, self.recordings)]
         count = len(points_world)
         padding = _PADDING.length(count) - count if cuda_graphs.are_used_on(self._device) else 0
         new, _ = self._claim(count, spare=padding)
