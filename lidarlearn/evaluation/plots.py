@@ -54,11 +54,11 @@ def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str
     for i, (method, path) in enumerate(paths.items()):
         axes.plot(*path.mT.numpy(), linewidth=1.5, label=method, **_line(i))
     axes.plot(0, 0, marker="o", markersize=7, color="black", linestyle="none", label="start", zorder=5)
-    axes.set_xlim(float(lower[0]), float(upper[0]))
-    axes.set_ylim(float(lower[1]), float(upper[1]))
-    axes.set_aspect("equal")
+    (left, bottom), (right, top) = lower.tolist(), upper.tolist()
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     _legend_beside(figure, axes)
     finish(axes, title, "x, forward at the start [m]", "y, left at the start [m]")
+    figure.draw_without_rendering()  # room for the labels is made about axes whose aspect only a first drawing settles
     return figure
 
 

@@ -39,6 +39,19 @@ def test_a_runaway_does_not_hide_the_rest(make_drive, longer):
     assert axes.get_xlim()[1] < 3 * float(truth[:, 0, 3].max())
 
 
+@pytest.mark.parametrize("scale", [(1.0, 0.02), (1.0, 1.0), (0.02, 1.0)], ids=["ahead", "both ways", "aside"])
+def test_labels_of_a_drive_of_any_shape_are_on_the_picture(tmp_path, scale):
+    angle = torch.linspace(0, 6.28, 200, dtype=torch.float64)
+    T_world = se3.identity(200)
+    T_world[:, :2, 3] = 200 * torch.stack([angle.sin(), angle.cos()], dim=1) * torch.tensor(scale)
+    figure = trajectory_figure("a", T_world, {"posenet_icp+p_f2m": T_world})
+    write_plots(tmp_path, [("a", figure)])
+    (axes,) = figure.axes
+    for label in (axes.xaxis.label, axes.yaxis.label, figure.legends[0]):
+        box = label.get_window_extent()
+        assert min(box.x0, box.y0) >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_trajectories_of_hardly_any_pose(make_drive, frames):
     T = make_drive(frames)
