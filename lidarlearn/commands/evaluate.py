@@ -20,7 +20,7 @@ from lidarlearn.commands import entry_point
 from lidarlearn.commands.checkpoint_options import OPTION, add_data, chosen_data
 from lidarlearn.commands.device import resolve_device
 from lidarlearn.commands.protocol import describe_networks, differing_settings, evaluation_protocol, method_settings
-from lidarlearn.commands.run_folder import code_digest, write_run_description
+from lidarlearn.commands.run_folder import code_digest, require_no_training, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.layout import TableLayout
@@ -73,8 +73,9 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     _seed(config.seed)
     resolve_device(config)
     run_folder = Path(config.run_dir)
+    require_no_training(run_folder)
     methods = _methods(config)
-    networks = {} if config.trajectories else describe_networks(config, methods)
+    networks = describe_networks(config, methods)
     layout: TableLayout | None = instantiate(config.table, _convert_="all")
     data: DataSet = instantiate(config.data)
     data.prepare(data.test_sequences)
@@ -96,7 +97,7 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     finally:
         if scores:
             _report(run_folder, protocol, Evaluation(sequences, poses, scores), layout)
-    if not config.trajectories and is_kitti_test_set(sequences.values()):
+    if is_kitti_test_set(sequences.values()):
         for method in methods:
             packed = write_submission(
                 run_folder / f"submission_{method}.zip", run_folder / "trajectories" / str(method)
@@ -184,12 +185,22 @@ def _require_use_of_checkpoint(config: DictConfig) -> None:
     if config.ckpt is not None and config.ckpt not in used and HydraConfig.get().runtime.choices["data"] != OPTION:
         raise UserError(
             f"ckpt={config.ckpt}: no method runs this network\n"
-            f"  change: networks.posenet={config.ckpt} where an experiment names another, or methods=[posenet,...]"
+            f"  change: networks.posenet={config.ckpt} where an experiment names another, or methods=[posenet,...], "
+            "or leave ckpt out"
         )
 
 
 def _methods(config: DictConfig) -> list[Method]:
+    """The methods to run; none where trajectories are scored in their stead."""
     names = config.methods
+    if config.trajectories is not None:
+        if names is not None:
+            raise UserError(
+                f"trajectories={config.trajectories} are scored instead of running methods={names}\n"
+                "  change: methods=null, or run the methods without trajectories=... and see both with "
+                "python -m lidarlearn.evaluation compare RUN RUN"
+            )
+        return []
     if names is None:
         names = _WITH_NETWORK if config.ckpt else _WITHOUT_NETWORK
     names = [str(name) for name in ([names] if isinstance(names, str) else names)]

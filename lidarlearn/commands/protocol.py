@@ -64,6 +64,8 @@ def evaluation_protocol(
 ) -> dict[str, Any]:
     """Everything that two results must have in common to be comparable, and what they were made with."""
     data = config.data
+    frame = ", ".join(dict.fromkeys(sequence.reference_frame for sequence in sequences.values()))
+    foreign = {"path": config.trajectories, "frame": config.trajectories_frame or frame}
     return {
         "data": data_name,
         "sequences": list(sequences),
@@ -71,7 +73,8 @@ def evaluation_protocol(
         "max_frames": data.max_frames,
         "beam_correction_deg": data.beam_correction_deg,
         "deskew": data.deskew,
-        "trajectory_frame": ", ".join(dict.fromkeys(sequence.reference_frame for sequence in sequences.values())),
+        "trajectory_frame": frame,
+        "trajectories": None if config.trajectories is None else foreign,
         "checkpoint": networks.get("posenet"),
         "networks": {name: network for name, network in networks.items() if name != "posenet"},
         "lidarlearn": lidarlearn.__version__,

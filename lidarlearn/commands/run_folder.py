@@ -5,6 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from lidarlearn.errors import UserError
 from lidarlearn.source_digest import PACKAGE, source_digest
 
 _SOURCE = Path(__file__).resolve().parent
@@ -23,6 +24,20 @@ def git_revision() -> str:
 def code_digest() -> str:
     """Hash of the package's source: the same code gives the same results, committed or not."""
     return source_digest(*PACKAGE.rglob("*.py"))
+
+
+def checkpoints_in(folder: Path) -> list[Path]:
+    """The checkpoints of the training whose folder it is; none where it is another's."""
+    return sorted((folder / "checkpoints").glob("*.ckpt"))
+
+
+def require_no_training(folder: Path) -> None:
+    """Raise a `UserError` where a run folder is that of a training, which would lose what it says of itself."""
+    if checkpoints_in(folder):
+        raise UserError(
+            f"{folder} holds a training, whose config.yaml and git_revision.txt would be overwritten\n"
+            f"  change: hydra.run.dir={folder / 'evaluation'}, or any other folder (hydra.sweep.dir or subdir with -m)"
+        )
 
 
 def write_run_description(folder: Path, config: DictConfig) -> None:

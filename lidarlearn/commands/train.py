@@ -19,7 +19,7 @@ from lidarlearn.commands import entry_point
 from lidarlearn.commands.checkpoint_options import chosen_data, quoted
 from lidarlearn.commands.device import resolve_device
 from lidarlearn.commands.resume import add_settings, require_resumable, settings_to_keep
-from lidarlearn.commands.run_folder import git_revision, write_run_description
+from lidarlearn.commands.run_folder import checkpoints_in, git_revision, write_run_description
 from lidarlearn.data.datamodule import OdometryDataModule
 from lidarlearn.errors import UserError
 from lidarlearn.training.module import PoseNetModule
@@ -133,8 +133,7 @@ def _require_workable(config: DictConfig) -> None:
 def _require_free(run_folder: Path, resumed: str | None) -> None:
     """Raise a `UserError` where a run folder holds another training: curves and checkpoints would mix."""
     folder = run_folder / "checkpoints"
-    found = sorted(folder.glob("*.ckpt"))
-    if found and (resumed is None or Path(resumed).resolve().parent != folder.resolve()):
+    if checkpoints_in(run_folder) and (resumed is None or Path(resumed).resolve().parent != folder.resolve()):
         raise UserError(
             f"{run_folder} holds the checkpoints of another training\n"
             f"  change: hydra.run.dir to another folder (hydra.sweep.dir or subdir with -m), or delete this one, "

@@ -1,11 +1,14 @@
 """Fixtures of the commands' tests."""
 
+import sys
+
 import numpy as np
 import pytest
 
+from lidarlearn.commands import evaluate
 from lidarlearn.evaluation.trajectories import write_kitti
 from tests.box_world import BoxSequence
-from tests.commands.scans import FRAMES
+from tests.commands.scans import FRAMES, SENSOR
 
 
 @pytest.fixture(scope="session")
@@ -19,3 +22,22 @@ def scans(tmp_path_factory):
             np.save(root / name / f"{i}.npy", scan.points.numpy())
         write_kitti(root / name / "poses.txt", drive.T_world_lidar)
     return root
+
+
+@pytest.fixture
+def call(monkeypatch, capsys, scans):
+    """Runs evaluate.py on the folder; what it prints."""
+
+    def run(*arguments):
+        own = ["device=cpu", "data=folder", f"data.root={scans}", *SENSOR]
+        monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments, *own])
+        evaluate.main()
+        return capsys.readouterr().out
+
+    return run
+
+
+@pytest.fixture
+def no_plots(monkeypatch):
+    """Drawing takes longer than everything else."""
+    monkeypatch.setattr(evaluate, "figures", lambda *_: iter(()))

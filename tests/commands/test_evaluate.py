@@ -26,25 +26,6 @@ def checkpoint(tmp_path_factory):
     )
 
 
-@pytest.fixture
-def call(monkeypatch, capsys, scans):
-    """Runs evaluate.py on the folder; what it prints."""
-
-    def run(*arguments):
-        own = ["device=cpu", "data=folder", f"data.root={scans}", *SENSOR]
-        monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments, *own])
-        evaluate.main()
-        return capsys.readouterr().out
-
-    return run
-
-
-@pytest.fixture
-def no_plots(monkeypatch):
-    """Drawing takes longer than everything else."""
-    monkeypatch.setattr(evaluate, "figures", lambda *_: iter(()))
-
-
 def results(folder):
     return json.loads((folder / "results.json").read_text())
 
@@ -121,7 +102,8 @@ def test_all_networks_that_are_not_there_are_named_before_data_are_made(no_data,
 
 
 def test_a_checkpoint_that_nothing_uses_is_refused(no_data, checkpoint, tmp_path, capsys):
-    error = refused(capsys, f"ckpt='{checkpoint}'", "experiment=paper/kitti", f"hydra.run.dir={tmp_path}")
+    chosen = ("data=kitti_00-08", "experiment=paper/kitti")
+    error = refused(capsys, f"ckpt='{checkpoint}'", *chosen, f"hydra.run.dir={tmp_path}")
     assert f"change: networks.posenet={checkpoint}" in error
     error = refused(capsys, f"ckpt='{checkpoint}'", "data=folder", "methods=[cv+p_f2m]", f"hydra.run.dir={tmp_path}")
     assert "no method runs this network" in error
