@@ -107,7 +107,8 @@ def _checkpoint(path: Path) -> dict[str, Any]:
         "sha256": sha256(path),
         "trained_on": {
             "data": trained_on["data_name"],
-            "train_sequences": trained_on["data"]["train_sequences"],
+            # of earlier versions, as they were set: null, or numbers
+            "train_sequences": trained_on.get("train_sequences", trained_on["data"]["train_sequences"]),
             "loss": trained_on["loss"],
             "git": trained_on["git"],
         },

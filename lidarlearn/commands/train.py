@@ -160,6 +160,7 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
     trained_on = {
         "data": {key: value for key, value in plain("data").items() if key != "root"},
         "data_name": data_name,
+        "train_sequences": list(datamodule.data.train_sequences),  # as the data set calls them: a setting may be null
         "loss": config.loss["_target_"].rpartition(".")[2],
         "git": git_revision(),
         "lidarlearn": lidarlearn.__version__,

@@ -34,9 +34,9 @@ class PoseNetModule(LightningModule):
         optimizer: takes the parameters.
         scheduler: takes the optimizer; steps once an epoch.
         trained_on: what to tell about a checkpoint, for people, for `evaluate.py` and for a training that goes on:
-            "data" (the data set's config, without the place where it lies), "data_name", "loss", "git", "lidarlearn",
-            "projection" (height, width, fov_up_deg, fov_down_deg of the network's image), and "settings" (see
-            `lidarlearn.commands.resume`).
+            "data" (the data set's config, without the place where it lies), "data_name", "train_sequences" (names),
+            "loss", "git", "lidarlearn", "projection" (height, width, fov_up_deg, fov_down_deg of the network's image),
+            and "settings" (see `lidarlearn.commands.resume`).
     """
 
     predicted_drives: list[PredictedDrive]

@@ -3,6 +3,13 @@
 import json
 
 import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.train import build_module
+from tests.commands.scans import SENSOR
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
 
@@ -30,3 +37,26 @@ def test_methods_are_not_left_out_for_files_without_a_word(call, foreign, tmp_pa
         call(f"hydra.run.dir={tmp_path / 'run'}", f"trajectories={foreign}", "methods=[ei+kd_f2m]")
     error = capsys.readouterr().err
     assert str(foreign) in error and "ei+kd_f2m" in error and "methods=null" in error
+
+
+def trained(path, *overrides):
+    """The checkpoint of a network that has yet to be trained; the names that it tells."""
+    settings = ["device=cpu", "run_dir=x", *overrides]
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        config = compose("train", settings)
+    module = build_module(config, instantiate(config.datamodule), "folder")
+    parts = dict(module.hparams)
+    content = {"module": f"{type(module).__module__}.{type(module).__qualname__}", "hyper_parameters": parts}
+    torch.save({**content, "state_dict": module.state_dict()}, path)
+    return parts["trained_on"]["train_sequences"]
+
+
+def test_what_a_network_has_seen_is_told_by_the_names_that_its_data_set_made_of_the_settings(
+    call, no_plots, scans, tmp_path
+):
+    checkpoint = tmp_path / "a.ckpt"
+    assert trained(checkpoint, "data=kitti_00-08", "data.train_sequences=[3,10]") == ["03", "10"]
+    assert trained(checkpoint, "data=folder", f"data.root={scans}", *SENSOR) == ["0", "1"]
+    call(f"hydra.run.dir={tmp_path / 'run'}", f"ckpt={checkpoint}", "methods=[posenet]", "data.test_sequences=['1']")
+    assert protocol(tmp_path / "run")["checkpoint"]["trained_on"]["train_sequences"] == ["0", "1"]
+    assert "*: the network was trained on this sequence" in (tmp_path / "run" / "results.md").read_text()
