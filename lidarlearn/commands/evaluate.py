@@ -26,7 +26,7 @@ from lidarlearn.errors import UserError
 from lidarlearn.evaluation.layout import TableLayout
 from lidarlearn.evaluation.methods import Method, parse_method
 from lidarlearn.evaluation.plots import figures, write_plots
-from lidarlearn.evaluation.report import print_tables, report_tables, sequences_trained_on, write_report
+from lidarlearn.evaluation.report import print_tables, report_tables, seen_in_training, write_report
 from lidarlearn.evaluation.run import Export, RunProgress, read_export, run_odometry
 from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.submission import is_kitti_test_set, write_submission
@@ -216,14 +216,14 @@ def _report(run_folder: Path, protocol: dict[str, Any], evaluation: Evaluation, 
     """Files, plots, TensorBoard and the printed tables."""
     from torch.utils.tensorboard import SummaryWriter  # slow to import, and only needed at the end
 
-    trained_on = sequences_trained_on(protocol)
     scores, poses = evaluation.scores, evaluation.T_world_lidar
-    write_report(run_folder, protocol, scores, trained_on, layout)
+    seen = seen_in_training(protocol, scores)
+    write_report(run_folder, protocol, scores, seen, layout)
     groups = {} if layout is None else layout.columns
     with SummaryWriter(str(run_folder)) as writer:
         for name, figure in figures(evaluation.sequences, poses, scores, groups):
             write_plots(run_folder / "plots", [(name, figure)])
             writer.add_figure(name, figure)
         writer.add_text("results", (run_folder / "results.md").read_text(encoding="utf-8"))
-    print_tables(report_tables(protocol["data"], scores, trained_on, layout))
+    print_tables(report_tables(protocol["data"], scores, seen, layout))
     print(f"results: {run_folder / 'results.md'}  plots: {run_folder / 'plots'}")

@@ -1,7 +1,8 @@
 """Results of several runs side by side: what was measured under the same protocol in one table, the rest apart."""
 
+import itertools
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.layout import TableLayout
-from lidarlearn.evaluation.report import report_tables, results_content, sequences_trained_on
+from lidarlearn.evaluation.report import report_tables, results_content, seen_in_training
 from lidarlearn.evaluation.run import Export
 from lidarlearn.evaluation.score import Score
 from lidarlearn.evaluation.tables import Table
@@ -17,6 +18,8 @@ from lidarlearn.metrics.kitti import SegmentAverage
 
 # Two results are comparable where these agree, and the scans of the sequences that they share.
 _PROTOCOL = ("beam_correction_deg", "deskew", "max_frames")
+
+_DIGESTS = ("network", "code")  # settings of which a few digits are enough to tell them apart
 
 Settings = dict[str, Any]  # dotted keys and plain values
 
@@ -47,10 +50,12 @@ class Group:
     Args:
         runs: in the order given.
         scores: all rows; where the same method was run with different settings, its name says which.
+        seen: methods, by these names, and sequences on which their networks were trained.
     """
 
     runs: Series[Run]
     scores: Series[Score]
+    seen: Set[tuple[str, str]]
 
     @property
     def title(self) -> str:
@@ -61,11 +66,7 @@ class Group:
 
     def tables(self, layout: TableLayout | None = None) -> list[Table]:
         """The same tables as of a single evaluation."""
-        trained_on: dict[str, list[str]] = {}
-        for run in self.runs:
-            for network, names in sequences_trained_on(run.protocol).items():
-                trained_on.setdefault(network, []).extend(names)
-        return report_tables(str(self.runs[0].protocol.get("data", "")), self.scores, trained_on, layout)
+        return report_tables(str(self.runs[0].protocol.get("data", "")), self.scores, self.seen, layout)
 
 
 def read_run(folder: Path) -> Run:
@@ -117,13 +118,14 @@ def comparable_groups(runs: Iterable[Run]) -> list[Group]:
             groups.append([run])
         else:
             group.append(run)
-    return [Group(group, _labelled(group)) for group in groups]
+    return [_group(runs) for runs in groups]
 
 
 def comparison(groups: Series[Group]) -> tuple[dict[str, Any], list[Table], str]:
     """What to write and print about groups of runs: content of `results.json`, tables, and a last section.
 
-    Where all runs are of one experiment, its table comes first, with the rows of all of them.
+    Where all runs are of one experiment, its table comes first, with the rows of all of them; or one for each group, if
+    two of them measured the same.
     """
     content = {
         "compared": [
@@ -132,13 +134,16 @@ def comparison(groups: Series[Group]) -> tuple[dict[str, Any], list[Table], str]
             for group in groups
         ]
     }  # fmt: skip
-    everything = Group([run for g in groups for run in g.runs], [row for g in groups for row in g.scores])
-    layouts = [run.layout for run in everything.runs]
+    layouts = [run.layout for group in groups for run in group.runs]
     layout = layouts[0] if all(other == layouts[0] for other in layouts) else None
-    tables = [] if layout is None else everything.tables(layout)[:1]
+    scores = [row for group in groups for row in group.scores]
+    tables = []
+    if layout is not None and len({(row.method, row.sequence) for row in scores}) == len(scores):
+        tables.append(layout.table(scores, {pair for group in groups for pair in group.seen}))
+        layout = None  # of each group
     for i, group in enumerate(groups):
         heading = "" if len(groups) == 1 else f" ({i + 1} of {len(groups)}: {group.title})"
-        tables += [replace(table, title=table.title + heading) for table in group.tables()]
+        tables += [replace(table, title=table.title + heading) for table in group.tables(layout)]
     return content, tables, _closing(groups)
 
 
@@ -162,29 +167,54 @@ def _measured_with(run: Run) -> str:
     return ", ".join(f"{key} {run.protocol[key]}" for key in keys if key in run.protocol)
 
 
-def _labelled(runs: Series[Run]) -> list[Score]:
-    """All rows, sequence by sequence within each method; methods whose settings differ say by what."""
-    rows = [(run, row) for run in runs for row in run.scores]
-    result: dict[tuple[str, str], Score] = {}
-    for method in dict.fromkeys(row.method for _, row in rows):
-        own = [(run, row) for run, row in rows if row.method == method]
-        variants = [run.settings[method, row.sequence] for run, row in own]
-        for (run, row), settings in zip(own, variants, strict=True):
-            label = method + _variation(settings, variants)
-            if (label, row.sequence) in result:
-                label += f" ({run.folder.name})"
-            result[label, row.sequence] = replace(row, method=label)
-    by_method = dict.fromkeys(label for label, _ in result)
-    return [score for label in by_method for (other, _), score in result.items() if other == label]
+def _group(runs: Series[Run]) -> Group:
+    """All rows, sequence by sequence within each method."""
+    by_method: dict[str, dict[str, list[Score]]] = {}
+    seen = set()
+    for run, labels in zip(runs, _labels(runs), strict=True):
+        for row in run.scores:
+            label = labels[row.method, row.sequence]
+            by_method.setdefault(row.method, {}).setdefault(label, []).append(replace(row, method=label))
+        for method, sequence in seen_in_training(run.protocol, run.scores):
+            seen.add((labels[method, sequence], sequence))
+    scores = [row for by_label in by_method.values() for rows in by_label.values() for row in rows]
+    return Group(runs, scores, seen)
+
+
+def _labels(runs: Series[Run]) -> list[dict[tuple[str, str], str]]:
+    """What to call each method and sequence of each run: methods whose settings differ say by what.
+
+    What several runs have alike is told apart by their folders, but for the first of them.
+    """
+    taken: set[tuple[str, str]] = set()
+    result = []
+    for run, folder in zip(runs, _distinct_folders(runs), strict=True):
+        labels = {}
+        for (method, sequence), settings in run.settings.items():
+            variants = [v for other in runs for (name, _), v in other.settings.items() if name == method]
+            labels[method, sequence] = method + _variation(settings, variants)
+        again = {label for (_, sequence), label in labels.items() if (label, sequence) in taken}
+        labels = {key: f"{label} ({folder})" if label in again else label for key, label in labels.items()}
+        taken |= {(label, sequence) for (_, sequence), label in labels.items()}
+        result.append(labels)
+    return result
+
+
+def _distinct_folders(runs: Series[Run]) -> list[str]:
+    """The shortest ends of the runs' paths that tell all of them apart."""
+    paths = [run.folder.resolve().parts for run in runs]
+    length = next(n for n in itertools.count(1) if len({path[-n:] for path in paths}) == len(set(paths)))
+    return ["/".join(path[-length:]) for path in paths]
 
 
 def _variation(settings: Settings, variants: Series[Settings]) -> str:
     """Those settings that differ between the variants, in brackets, by the last words of their names where these do.
 
-    A part is called by its class, as in "weight=Huber". The sensor's projection belongs to the data.
+    A part is called by its class, as in "weight=Huber". The sensor's projection belongs to the data. Variants of which
+    nothing is known, as of another tool's trajectories, differ in nothing.
     """
     known = dict.fromkeys(key for variant in variants for key in variant if "projection" not in key.split("."))
-    keys = [key for key in known if len({repr(variant.get(key)) for variant in variants}) > 1]
+    keys = [key for key in known if len({repr(variant.get(key)) for variant in variants if variant}) > 1]
     names = {key: key.removesuffix("._target_") for key in keys}
     last = [name.rpartition(".")[2] for name in names.values()]
     shown = {key: short if last.count(short) == 1 else names[key] for key, short in zip(keys, last, strict=True)}
@@ -193,6 +223,8 @@ def _variation(settings: Settings, variants: Series[Settings]) -> str:
 
 
 def _value(key: str, value: object) -> str:
+    if key in _DIGESTS:
+        return str(value)[:8]
     return str(value).rpartition(".")[2] if key.endswith("._target_") else str(value)
 
 

@@ -44,16 +44,16 @@ class TableLayout:
             if len(values) != len(self.columns):
                 raise ValueError(f"table.published.{method}: {len(values)} values for {len(self.columns)} columns")
 
-    def table(self, scores: Series[Score], trained_on: Mapping[str, Collection[str]]) -> Table:
+    def table(self, scores: Series[Score], seen: Collection[tuple[str, str]] = ()) -> Table:
         """The table of what was measured.
 
         Args:
             scores: of all methods on all sequences.
-            trained_on: names of sequences by the network, i.e. the initialization, that was trained on them.
+            seen: methods and sequences on which their networks were trained.
         """
         what, digits = _FIGURES[self.figure]
         methods = dict.fromkeys(row.method for row in scores)
-        rows = [(m, *(self._cell(m, names, scores, trained_on, digits) for names in self.columns.values()))
+        rows = [(m, *(self._cell(m, names, scores, seen, digits) for names in self.columns.values()))
                 for m in methods]  # fmt: skip
         reference = [
             (f"{method} ({self.source})", *("-" if value is None else f"{value:g}" for value in values))
@@ -73,7 +73,7 @@ class TableLayout:
         method: str,
         names: Series[str],
         scores: Series[Score],
-        trained_on: Mapping[str, Collection[str]],
+        seen: Collection[tuple[str, str]],
         digits: int,
     ) -> str:
         of_method = [row for row in scores if row.method == method and row.sequence in names]
@@ -82,14 +82,9 @@ class TableLayout:
             return "-"
         mean: MeanOverSequences = average_scores(rows)[0].mean_over_sequences
         value = getattr(mean, self.figure)
-        seen = set(names) <= set(trained_on.get(network_of(method), ()))
-        partly = f" ({len(rows)} of {len(names)})" if len(rows) < len(names) else ""
-        return f"{value:.{digits}f}{'*' if seen else ''}{partly}"
-
-
-def network_of(method: str) -> str:
-    """The initialization in a method's name, which may be that of a network."""
-    return method.partition("+")[0].partition(" ")[0]
+        star = "*" if all((method, row.sequence) in seen for row in rows) else ""
+        run = len({row.sequence for row in rows})
+        return f"{value:.{digits}f}{star}" + (f" ({run} of {len(names)})" if run < len(names) else "")
 
 
 def _pooling(figure: str) -> str:

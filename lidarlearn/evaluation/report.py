@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import asdict
 from os import PathLike
@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from lidarlearn.evaluation.layout import TableLayout, network_of
+from lidarlearn.evaluation.layout import TableLayout
 from lidarlearn.evaluation.published import published_beside, whole_kitti_sequences
 from lidarlearn.evaluation.score import Averages, Score, average_scores
 from lidarlearn.evaluation.tables import Table
@@ -29,15 +29,14 @@ _DETAILS_NOTES = {
     "flagged": "flagged: scans whose pose the odometry itself doubts, see the .health.csv files.",
 }
 
-TrainedOn = Mapping[str, Collection[str]]
-_NO_NETWORK: TrainedOn = {}
+Seen = Collection[tuple[str, str]]  # methods and sequences on which their networks were trained
 
 
 def write_report(
     folder: Path,
     protocol: Mapping[str, Any],
     scores: Series[Score],
-    trained_on: TrainedOn = _NO_NETWORK,
+    seen: Seen = (),
     layout: TableLayout | None = None,
 ) -> None:
     """Write `results.json` and `results.md` into a folder.
@@ -47,13 +46,13 @@ def write_report(
         protocol: how the scores came about; `protocol["data"]` is the name of the data group. Plain values, paths
             and nested mappings and lists of these.
         scores: all methods on all sequences, in the order in which they are to be shown.
-        trained_on: names of the sequences on which each network was trained, by the name that it has in methods.
+        seen: methods and sequences on which their networks were trained.
         layout: how an experiment sums up its sequences; None for no table of that kind.
     """
     results = {"protocol": protocol, **results_content(scores)}
     if layout is not None:
         results["table"] = asdict(layout)
-    tables = report_tables(str(protocol.get("data", "")), scores, trained_on, layout)
+    tables = report_tables(str(protocol.get("data", "")), scores, seen, layout)
     write_results(folder, results, tables, protocol_markdown(protocol))
 
 
@@ -70,10 +69,12 @@ def write_results(folder: Path, results: Mapping[str, Any], tables: Series[Table
     (folder / "results.md").write_text(f"# Results\n\n{body}\n{closing}", encoding="utf-8")
 
 
-def sequences_trained_on(protocol: Mapping[str, Any]) -> TrainedOn:
-    """Which sequences each network of a protocol was trained on, by the network's name in methods."""
+def seen_in_training(protocol: Mapping[str, Any], scores: Iterable[Score]) -> set[tuple[str, str]]:
+    """Methods and sequences among some scores of which the method's network was trained on the sequence."""
     networks = {"posenet": protocol.get("checkpoint"), **protocol.get("networks", {})}
-    return {name: network["trained_on"]["train_sequences"] or () for name, network in networks.items() if network}
+    names = {name: network["trained_on"]["train_sequences"] or () for name, network in networks.items() if network}
+    rows = ((row.method, row.sequence) for row in scores)
+    return {(method, sequence) for method, sequence in rows if sequence in names.get(method.partition("+")[0], ())}
 
 
 def results_content(scores: Series[Score]) -> dict[str, Any]:
@@ -91,23 +92,21 @@ def print_tables(tables: Series[Table], console: Console | None = None) -> None:
         table.print(out)
 
 
-def report_tables(
-    data: str, scores: Series[Score], trained_on: TrainedOn = _NO_NETWORK, layout: TableLayout | None = None
-) -> list[Table]:
+def report_tables(data: str, scores: Series[Score], seen: Seen = (), layout: TableLayout | None = None) -> list[Table]:
     """The experiment's table; the paper's kind of table, a column a sequence; then everything else, a row each.
 
     Without any ground truth the last alone. Arguments as for `write_report`, `data` being the name of the data group.
     """
     tables = [details_table(scores)]
     if any(row.path_length_m is not None for row in scores):
-        tables.insert(0, drift_table(data, scores, trained_on))
-    return tables if layout is None else [layout.table(scores, trained_on), *tables]
+        tables.insert(0, drift_table(data, scores, seen))
+    return tables if layout is None else [layout.table(scores, seen), *tables]
 
 
-def drift_table(data: str, scores: Series[Score], trained_on: TrainedOn = _NO_NETWORK) -> Table:
+def drift_table(data: str, scores: Series[Score], seen: Seen = ()) -> Table:
     """Average translation error of each method on each sequence, both averages of several, published rows where due."""
     sequences = list(dict.fromkeys(row.sequence for row in scores))
-    cells = {(row.method, row.sequence): _drift_cell(row, trained_on) for row in scores}
+    cells = {(row.method, row.sequence): _drift_cell(row, seen) for row in scores}
     averages = average_scores(scores)
     complete = max((row.mean_over_sequences.sequences for row in averages), default=0)
     rows = [
@@ -156,9 +155,9 @@ def details_table(scores: Series[Score]) -> Table:
     )
 
 
-def _drift_cell(row: Score, trained_on: TrainedOn) -> str:
+def _drift_cell(row: Score, seen: Seen) -> str:
     """The percentage; where the drive is too short for it, the mean error between scans stands in, in brackets."""
-    star = "*" if row.sequence in trained_on.get(network_of(row.method), ()) else ""
+    star = "*" if (row.method, row.sequence) in seen else ""
     if row.avg_translation_error_percent is not None:
         return _text(row.avg_translation_error_percent, 3) + star
     if row.rpe_translation_mean_m is not None:

@@ -89,6 +89,35 @@ def test_a_run_that_was_repeated_keeps_both_rows(make_run):
     assert methods(group) == [("m", "a"), ("m (2)", "a")]
 
 
+def test_runs_that_were_repeated_are_told_apart_by_as_much_of_their_paths_as_it_takes(make_run):
+    runs = [make_run(f"{sweep}/0", "m", "a", settings={"k": 1}) for sweep in ("A", "B", "C")]
+    (group,) = groups(*runs)
+    assert methods(group) == [("m", "a"), ("m (B/0)", "a"), ("m (C/0)", "a")]
+    (group,) = groups(*runs, make_run("other", "m", "b", settings={"k": 1}))
+    assert methods(group) == [("m", "a"), ("m", "b"), ("m (B/0)", "a"), ("m (C/0)", "a")]
+
+
+def test_trajectories_without_settings_differ_in_none(make_run):
+    own = [make_run(f"own_{k}", "m", "a", settings={"k": k, "same": 1}) for k in (1, 2)]
+    (group,) = groups(*own, make_run("scored_again", "m", "a"))
+    assert methods(group) == [("m [k=1]", "a"), ("m [k=2]", "a"), ("m", "a")]
+    (group,) = groups(own[0], make_run("scored_again", "m", "a"))
+    assert methods(group) == [("m", "a"), ("m (scored_again)", "a")]
+
+
+def test_each_network_is_marked_where_it_was_trained_itself(make_run):
+    def run(digest, seen, evaluated):
+        network = {"path": "best.ckpt", "sha256": digest, "trained_on": {"train_sequences": seen}}
+        return make_run(
+            f"{digest[0]}_{evaluated}", "posenet", evaluated, settings={"network": digest}, checkpoint=network
+        )
+
+    parts = groups(run("a" * 64, ["x"], "x"), run("a" * 64, ["x"], "y"), run("b" * 64, ["y"], "x"))
+    (drift, _) = comparison(parts)[1]
+    marked = {row[0]: ["*" in cell for cell in row[1:3]] for row in drift.rows}
+    assert marked == {"posenet [network=aaaaaaaa]": [True, False], "posenet [network=bbbbbbbb]": [False, False]}
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -117,6 +146,17 @@ def test_an_experiments_table_spans_data_sets(make_run, tmp_path):
     written = json.loads((tmp_path / "joint" / "results.json").read_text())
     assert [len(group["results"]) for group in written["compared"]] == [1, 1]
     assert "both" in (tmp_path / "joint" / "results.md").read_text()
+
+
+def test_what_was_measured_twice_is_not_averaged_in_an_experiments_table(make_run):
+    layout = TableLayout("both", {"towns": ["a", "b"]})
+    runs = [make_run(str(share), "m", "a", share, layout=layout, max_frames=int(1e4 * share)) for share in (0.01, 0.02)]
+    _, tables, _ = comparison(groups(*runs))
+    cells = {table.title: table.rows for table in tables if table.title.startswith("both")}
+    (first, one), (second, two) = cells.items()
+    assert "(1 of 2: towns" in first and "max_frames 200" in second
+    errors = [read_run(run).scores[0].avg_translation_error_percent for run in runs]
+    assert [one, two] == [(("m", f"{error:.3f} (1 of 2)"),) for error in errors]
 
 
 def test_a_folder_without_results_is_named(tmp_path):

@@ -76,7 +76,7 @@ def test_a_protocol_that_json_cannot_hold_is_refused(tmp_path, scores):
 
 
 def test_drift_table(scores):
-    table = drift_table("simulated_urban", scores, trained_on={"posenet": ["a"]})
+    table = drift_table("simulated_urban", scores, seen={("posenet", "a")})
     assert table.columns == ("method", "a", "short", "mean of sequences", "mean of segments")
     row = cells(table, "posenet")
     error = f"{scores[0].avg_translation_error_percent:.3f}"
