@@ -1,5 +1,6 @@
 """What a result was made with: the settings behind each trajectory, and the protocol that its table carries."""
 
+import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from lidarlearn.data.sequence import Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.methods import Method
 from lidarlearn.training.checkpoints import load_checkpoint, sha256
+
+_STEPS_PER_M = 2**13  # 0.1 mm; a power of two, since decimals in files would often lie on the edge between two steps
 
 
 def describe_networks(config: DictConfig, methods: Iterable[Method]) -> dict[str, dict[str, Any]]:
@@ -70,6 +73,7 @@ def evaluation_protocol(
         "data": data_name,
         "sequences": list(sequences),
         "scans": {name: sequence.fingerprint[:16] for name, sequence in sequences.items()},
+        "ground_truth": {name: ground_truth_digest(sequence) for name, sequence in sequences.items()},
         "max_frames": data.max_frames,
         "beam_correction_deg": data.beam_correction_deg,
         "deskew": data.deskew,
@@ -83,6 +87,17 @@ def evaluation_protocol(
         "seed": config.seed,
         "device": config.device,
     }
+
+
+def ground_truth_digest(sequence: Sequence) -> str | None:
+    """Changes whenever a sequence would be scored against other poses, None where there are none to score against.
+
+    Machines differ in the last digits of what they compute from the same files: these do not count.
+    """
+    if sequence.T_world_lidar is None:
+        return None
+    poses = torch.cat([sequence.T_world_lidar, sequence.T_reference_lidar[None]])
+    return hashlib.sha256((poses * _STEPS_PER_M).round().long().numpy().tobytes()).hexdigest()[:16]
 
 
 def _is_file(path: str | None) -> bool:

@@ -16,8 +16,10 @@ from lidarlearn.evaluation.score import Score
 from lidarlearn.evaluation.tables import Table
 from lidarlearn.metrics.kitti import SegmentAverage
 
-# Two results are comparable where these agree, and the scans of the sequences that they share.
+# Two results are comparable where these agree...
 _PROTOCOL = ("beam_correction_deg", "deskew", "max_frames")
+# ...and these of the sequences that they share; results of earlier versions tell nothing of the ground truth.
+_OF_SEQUENCES = {"scans": "scans", "ground_truth": "ground truth"}
 
 _DIGESTS = ("network", "code")  # settings of which a few digits are enough to tell them apart
 
@@ -102,10 +104,13 @@ def differences(a: Run, b: Run) -> list[str]:
         for key in _PROTOCOL
         if a.protocol.get(key) != b.protocol.get(key)
     ]
-    mine, theirs = a.protocol.get("scans", {}), b.protocol.get("scans", {})
-    other = [name for name in mine if name in theirs and mine[name] != theirs[name]]
-    if other and not found:
-        found.append(f"the scans of sequence {', '.join(other)} are not the same")
+    if found:
+        return found  # which is why the following differs, too
+    for key, what in _OF_SEQUENCES.items():
+        mine, theirs = a.protocol.get(key, {}), b.protocol.get(key, {})
+        other = [name for name in mine if name in theirs and mine[name] != theirs[name]]
+        if other:
+            found.append(f"not the same {what} of sequence {', '.join(other)}")
     return found
 
 

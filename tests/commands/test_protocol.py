@@ -8,7 +8,10 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.protocol import ground_truth_digest
 from lidarlearn.commands.train import build_module
+from lidarlearn.geometry import se3
+from tests.box_world import BoxSequence
 from tests.commands.scans import SENSOR
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
@@ -60,3 +63,23 @@ def test_what_a_network_has_seen_is_told_by_the_names_that_its_data_set_made_of_
     call(f"hydra.run.dir={tmp_path / 'run'}", f"ckpt={checkpoint}", "methods=[posenet]", "data.test_sequences=['1']")
     assert protocol(tmp_path / "run")["checkpoint"]["trained_on"]["train_sequences"] == ["0", "1"]
     assert "*: the network was trained on this sequence" in (tmp_path / "run" / "results.md").read_text()
+
+
+def test_what_a_drive_is_scored_against_is_told_by_what_matters_of_it():
+    drive = BoxSequence("0", 6)
+    digest = ground_truth_digest(drive)
+    assert len(digest) == 16 and ground_truth_digest(BoxSequence("0", 6)) == digest
+    drive.T_world_lidar = drive.T_world_lidar * (1 + 1e-15)
+    assert ground_truth_digest(drive) == digest
+    drive.T_world_lidar[-1, 0, 3] += 1e-3
+    assert ground_truth_digest(drive) != digest
+    camera = BoxSequence("0", 6)
+    camera.T_reference_lidar = se3.exp(torch.full((6,), 1e-3, dtype=torch.float64))
+    assert ground_truth_digest(camera) != digest
+    assert ground_truth_digest(BoxSequence("0", 6, truth=False)) is None
+
+
+def test_the_ground_truth_is_part_of_the_protocol(call, no_plots, tmp_path):
+    call(f"hydra.run.dir={tmp_path}", "methods=[ni]", "data.test_sequences=['0','1']")
+    digests = protocol(tmp_path)["ground_truth"]
+    assert list(digests) == ["0", "1"] and all(len(digest) == 16 for digest in digests.values())

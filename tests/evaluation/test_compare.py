@@ -22,7 +22,7 @@ def make_run(tmp_path, make_sequence, longer):
     def make(name, method, sequence, share=0.01, settings=None, layout=None, **protocol):
         folder, drive = tmp_path / name, make_sequence(sequence, 300)
         T_world = longer(drive.T_world_lidar, share)
-        stamp = PROTOCOL | {"scans": {sequence: "f00d"}} | protocol
+        stamp = PROTOCOL | {"scans": {sequence: "f00d"}, "ground_truth": {sequence: "7007"}} | protocol
         write_report(folder, stamp, [score(method, T_world, drive, 10.0)], layout=layout)
         if settings is not None:
             export = Export(folder / "trajectories" / method, sequence)
@@ -124,7 +124,8 @@ def test_each_network_is_marked_where_it_was_trained_itself(make_run):
         ({"beam_correction_deg": 0.205}, "beam_correction_deg: 0.0 against 0.205"),
         ({"deskew": True}, "deskew: false against true"),
         ({"max_frames": 50}, "max_frames: null against 50"),
-        ({"scans": {"a": "beef"}}, "scans of sequence a"),
+        ({"scans": {"a": "beef"}}, "not the same scans of sequence a"),
+        ({"ground_truth": {"a": "beef"}}, "not the same ground truth of sequence a"),
     ],
 )
 def test_what_was_measured_otherwise_is_kept_apart_and_says_why(make_run, change, words):
@@ -133,6 +134,11 @@ def test_what_was_measured_otherwise_is_kept_apart_and_says_why(make_run, change
     _, tables, closing = comparison(apart)
     assert len(tables) == 4 and "(2 of 2: towns" in tables[2].title
     assert "Not comparable: 1 and 2" in closing and words in closing
+
+
+def test_results_of_earlier_versions_tell_nothing_of_the_ground_truth_and_stay_comparable(make_run):
+    (group,) = groups(make_run("1", "m", "a"), make_run("2", "n", "a", ground_truth={}))
+    assert methods(group) == [("m", "a"), ("n", "a")]
 
 
 def test_an_experiments_table_spans_data_sets(make_run, tmp_path):
