@@ -1,12 +1,14 @@
 """A table as text: the same for a Markdown file and for the terminal."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
+
+_LEGIBLE = 4  # letters of a folded heading or label that a line has at least
 
 
 @dataclass(frozen=True)
@@ -42,9 +44,17 @@ class Table:
         return f"### {self.title}\n\n{text}\n" + "".join(f"\n{note}\n" for note in self.notes)
 
     def print(self, console: Console) -> None:
-        """Print it to a terminal."""
-        widths = self._widths(console.width)
-        roomy = sum(widths) + 2 * len(widths) < console.width
+        """Print it to a terminal; columns that find no room beside the others come below them, labels repeated."""
+        console.print(Text(self.title, "bold"))  # not the table's own title, which folds with a narrow table
+        for block in self._blocks(console.width):
+            console.print(block._set_for(console.width))
+        for note in self.notes:
+            console.print(Text(note, "dim"))
+
+    def _set_for(self, available: int) -> RichTable:
+        """All columns as the terminal takes them."""
+        widths = self._widths(available)
+        roomy = sum(widths) + 2 * len(widths) < available
         table = RichTable(box=SIMPLE_HEAD, padding=(0, int(roomy), 0, 0))
         best = self._lowest()
         for i, (column, width) in enumerate(zip(self._headings(), widths, strict=True)):
@@ -56,10 +66,7 @@ class Table:
             table.add_section()
         for row in self.reference:
             table.add_row(*map(Text, row), style="dim")
-        console.print(Text(self.title, "bold"))  # not the table's own title, which folds with a narrow table
-        console.print(table)
-        for note in self.notes:
-            console.print(Text(note, "dim"))
+        return table
 
     def _lowest(self) -> dict[int, str]:
         """The cell of the lowest figure in each chosen column that has several."""
@@ -74,13 +81,45 @@ class Table:
         """Headings for narrow columns: a word a line above figures."""
         return [c if i < self.labels else c.replace(" ", "\n") for i, c in enumerate(self.columns)]
 
-    def _widths(self, available: int) -> list[int]:
-        """Width of each column in a terminal: where it is narrow labels and headings fold, but no method or figure."""
-        widths, least = [], []
+    def _blocks(self, available: int) -> list["Table"]:
+        """The whole table where no figure has to fold, else as many columns at a time as fit beside the labels."""
+        widest, least = self._extents()
+        if sum(least) + len(least) + 1 <= available:
+            return [self]
+        beside_labels = available - 1 - sum(width + 1 for width in (least[0], *widest[1 : self.labels]))
+        chosen: list[list[int]] = []
+        room = 0
+        for i in range(self.labels, len(self.columns)):
+            if widest[i] + 1 > room:
+                chosen.append([*range(self.labels)])
+                room = beside_labels
+            chosen[-1].append(i)
+            room -= widest[i] + 1
+        return [self._only(columns) for columns in chosen]
+
+    def _only(self, chosen: list[int]) -> "Table":
+        return replace(
+            self,
+            columns=tuple(self.columns[i] for i in chosen),
+            rows=tuple(tuple(row[i] for i in chosen) for row in self.rows),
+            reference=tuple(tuple(row[i] for i in chosen) for row in self.reference),
+            lowest=frozenset(k for k, i in enumerate(chosen) if i in self.lowest),
+        )
+
+    def _extents(self) -> tuple[list[int], list[int]]:
+        """Width of each column at which nothing folds, and that at which labels and headings do, but no figure."""
+        widest, least = [], []
         for i, heading in enumerate(self._headings()):
             own = max((len(row[i]) for row in self.rows), default=1)
-            widths.append(max(own, *map(len, heading.split("\n")), *(len(row[i]) for row in self.reference)))
-            least.append(own if i == 0 or i >= self.labels else min(own, 4))
+            whole = max(own, *(len(row[i]) for row in self.reference), 1)
+            widest.append(max(whole, *map(len, heading.split("\n"))))
+            legible = min(widest[i], _LEGIBLE)
+            least.append(own if i == 0 else legible if i < self.labels else max(whole, legible))
+        return widest, least
+
+    def _widths(self, available: int) -> list[int]:
+        """Width of each column in a terminal: where it is narrow labels and headings fold, but no method or figure."""
+        widths, least = self._extents()
         excess = sum(widths) + len(widths) + 1 - available  # a space around each
         for i in sorted(range(len(widths)), key=lambda i: least[i] - widths[i]):
             cut = max(0, min(excess, widths[i] - least[i]))

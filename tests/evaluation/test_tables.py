@@ -1,5 +1,6 @@
 from io import StringIO
 
+import pytest
 from rich.console import Console
 
 from lidarlearn.evaluation.tables import Table
@@ -55,6 +56,33 @@ def test_a_narrow_terminal_wraps_labels_and_not_methods_and_figures():
     table.print(Console(file=out, width=32))
     assert any("posenet+p_f2m" in line and "123.456" in line for line in out.getvalue().splitlines())
     assert "simulated_urban" not in out.getvalue()
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100])
+def test_figures_that_find_no_room_come_below_and_do_not_fold(width):
+    names = [f"{i:02d}" for i in range(11)]
+    figures = [f"{100 + i}.{i:03d}*" for i in range(11)]
+    reference = ("a method of somebody (published)", *(f"{i}.25" for i in range(11)))
+    table = Table("Error [%]", ("method", *names), (("posenet+p_f2m", *figures),), (reference,), lowest=frozenset({11}))
+    out = StringIO()
+    table.print(Console(file=out, width=width))
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    printed = [line for line in lines if "posenet+p_f2m" in line]
+    assert [word for line in printed for word in line.split()[1:]] == figures
+    headings = [word for line in lines if line.split()[:1] == ["method"] for word in line.split()[1:]]
+    assert headings == names and out.getvalue().count("Error [%]") == 1
+    assert all(figure in out.getvalue() for figure in reference[1:])
+
+
+def test_what_is_best_stays_so_where_columns_come_below():
+    table = Table(
+        "t", ("method", "00", "01"), (("long+name", "0.5", "0.7"), ("b", "0.6", "0.2")), lowest=frozenset({1, 2})
+    )
+    out = StringIO()
+    table.print(Console(file=out, width=17, force_terminal=True, color_system="standard"))
+    text = out.getvalue()
+    assert text.count("method") == 2 and all(f"\x1b[1m{figure}" in text for figure in ("0.5", "0.2"))
 
 
 def test_a_table_without_rows_prints():
