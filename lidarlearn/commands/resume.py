@@ -3,9 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import Timer
-from lightning.pytorch.utilities import rank_zero_warn
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 from torch.optim import Optimizer
@@ -21,11 +18,9 @@ from lidarlearn.commands.checkpoint_options import (
     write_data,
     write_option,
 )
-from lidarlearn.errors import UserError
 from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.module import PoseNetModule
 from lidarlearn.training.parts import require_plain, require_trusted
-from lidarlearn.training.progress import time_left_s
 
 _FIXED = {"model": nn.Module, "loss": nn.Module, "optimizer": Optimizer, "scheduler": LRScheduler}
 
@@ -92,47 +87,6 @@ def add_settings(arguments: list[str], folder: Path) -> None:
         write_option(folder, part, parts[part])
     write_option(folder, "recipe", recipe, header=GLOBAL)
     add_to_search_path(arguments, folder, RECIPE, "~recipe/for_data")
-
-
-def require_resumable(path: Path, module: PoseNetModule, trainer: Trainer) -> None:
-    """Raise a `UserError` where a training cannot go on from a checkpoint, and warn where it goes on elsewhere.
-
-    Args:
-        path: the checkpoint.
-        module: of the training that is to go on, as its trainer.
-        trainer: whose limits count from the very first start.
-    """
-    checkpoint = load_checkpoint(path)
-    for part in _FIXED:
-        was, now = checkpoint["hyper_parameters"][part], module.hparams[part]
-        changed = [key for key in {**was, **now} if was.get(key) != now.get(key)]
-        if changed:
-            differences = ", ".join(f"{key} was {was.get(key)} and is {now.get(key)}" for key in changed)
-            raise UserError(
-                f"ckpt={path} does not go on with another {part}: {differences}\n"
-                f"  change: leave the settings of the {part} to the checkpoint, or train anew, without ckpt"
-            )
-    for what, done, most in (
-        ("epochs", checkpoint["epoch"] + 1, trainer.max_epochs),
-        ("steps", checkpoint["global_step"], trainer.max_steps),
-    ):
-        if most is not None and 0 <= most <= done:
-            raise UserError(
-                f"ckpt={path} has already seen {done} of {most} {what}\n  change: trainer.max_{what}={2 * done}"
-            )
-    clock = checkpoint["callbacks"].get(Timer.__qualname__, {}).get("time_elapsed", {}).get("train", 0.0)
-    left = time_left_s(trainer)
-    if left is not None and left <= clock:
-        raise UserError(
-            f"ckpt={path} has already been trained for {clock:.0f} s, which is all of trainer.max_time\n"
-            "  change: trainer.max_time, which counts from the first start"
-        )
-    batches = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
-    if not batches["is_last_batch"]:
-        rank_zero_warn(
-            f"ckpt={path} was stopped within epoch {checkpoint['epoch'] + 1}, after {batches['current']['completed']} "
-            "batches: training goes on with the next epoch, and the others of this one are left out"
-        )
 
 
 def _only(keys: tuple[str, ...], settings: dict[str, Any]) -> dict[str, Any]:

@@ -18,13 +18,14 @@ import lidarlearn
 from lidarlearn.commands import entry_point
 from lidarlearn.commands.checkpoint_options import chosen_data, quoted
 from lidarlearn.commands.device import resolve_device
-from lidarlearn.commands.resume import add_settings, require_resumable, settings_to_keep
+from lidarlearn.commands.resume import add_settings, settings_to_keep
 from lidarlearn.commands.run_folder import checkpoints_in, git_revision, write_run_description
 from lidarlearn.data.datamodule import OdometryDataModule
 from lidarlearn.errors import UserError
 from lidarlearn.training.module import PoseNetModule
 from lidarlearn.training.parts import build
 from lidarlearn.training.quiet import quiet
+from lidarlearn.training.resuming import require_resumable
 
 _PRECISIONS = ("None", "32-true", "32", "bf16-mixed", "bf16", "16-mixed", "16")
 _PLAIN_CHARACTERS = frozenset(string.ascii_letters + string.digits + "/._-:+")

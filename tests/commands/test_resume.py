@@ -14,9 +14,10 @@ from omegaconf import OmegaConf
 from lidarlearn.commands import evaluate, train
 from lidarlearn.commands.checkpoint_options import add_data
 from lidarlearn.commands.configs import config_directory
-from lidarlearn.commands.resume import add_settings, require_resumable
+from lidarlearn.commands.resume import add_settings
 from lidarlearn.errors import UserError
 from lidarlearn.training.parts import UntrustedTargetError
+from lidarlearn.training.resuming import require_resumable
 from tests.commands.scans import FRAMES, SENSOR
 from tests.training.runs import curves
 
