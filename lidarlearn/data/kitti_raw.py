@@ -6,14 +6,14 @@ oxts/{data/%010d.txt, timestamps.txt}}` and `DATE/calib_imu_to_velo.txt`.
 The laser turns clockwise seen from above, from the rear over the left side: a point's time follows from its azimuth.
 A scan's pose is that of the middle of its sweep, when the laser faces forward: the GPS/IMU poses are interpolated
 there (a packet lies 12 to 22 ms off; taking it as it stands doubles the disagreement with registered scans). Scans
-keep their number where the recording dropped some; the dropped ones are blank lines in the time stamps.
+keep their number where the recording dropped some; the dropped ones are blank lines in the time stamps. Scans more than
+0.1 s before the first packet or after the last one are left out: nothing tells where they were.
 """
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -21,7 +21,7 @@ from torch import Tensor
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.interpolation import interpolate_poses
+from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.oxts import read_oxts_poses, read_rigid_transform, read_timestamps
 from lidarlearn.data.pose_files import start_at_identity
@@ -65,6 +65,8 @@ ODOMETRY_DRIVES = {
     "09": Drive("2011_09_30_drive_0033", 0, 1590),
     "10": Drive("2011_09_30_drive_0034", 0, 1200),
 }
+
+_SLACK_S = 0.1  # by which a scan may be before the first or after the last GPS/IMU packet
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -136,22 +138,33 @@ class KittiRaw(DataSetOnDisk):
 
     def sequence(self, name: str) -> KittiRawSequence:
         """Open a drive, or the part of one that is a sequence of KITTI odometry."""
-        return self._open(name, self._scans(name).first(self.max_frames))
+        return self._open(name, self.max_frames)
 
     def open_for_check(self, name: str) -> KittiRawSequence:
         """Open a drive of one scan: a long one has thousands of GPS/IMU packets, a file each."""
-        return self._open(name, self._scans(name).first(1))
+        return self._open(name, 1)
 
-    def _open(self, name: str, scans: ScanFiles) -> KittiRawSequence:
+    def _open(self, name: str, count: int | None) -> KittiRawSequence:
+        """Open the first `count` of a drive's scans that its packets cover, all for None."""
         folder = self._folder(name)
+        scans = self._scans(name)
         if not len(scans):
             raise self._lacking(name, folder / "velodyne_points" / "data" / f"*.bin{scans.misnamed}")
+        packets = _packets(folder)
+        packet_times = self._packet_times(name, packets) if len(packets) else None
+        if packet_times is not None:
+            scans = scans.select(covered(name, self._timestamps(name, scans), packet_times, _SLACK_S))
+            if not len(scans):
+                raise DamagedFileError(
+                    folder / "oxts" / "timestamps.txt", "its times do not overlap with those of the scans"
+                )
+        scans = scans.first(count)
         warn_of_gaps(name, scans)
         timestamps = self._timestamps(name, scans)
         return KittiRawSequence(
             name=name,
             scans=scans,
-            T_world_lidar=self._ground_truth(name, timestamps),
+            T_world_lidar=None if packet_times is None else self._poses(name, packets, packet_times, timestamps),
             timestamps=timestamps,
             beam_correction_deg=self.beam_correction_deg,
         )
@@ -182,11 +195,14 @@ class KittiRaw(DataSetOnDisk):
             layout.describe_rows(report, name, stamps, f"{end} times", rows_needed, needed=True)
         ground_truth_needed = name in self.test_sequences
         note = report.missing if ground_truth_needed else report.odd
-        packets = len(_packets(folder))
+        packets = _packets(folder).numbers
         if not packets:
             note(name, f"no ground truth: no files in {folder / 'oxts' / 'data'}")
             return
-        layout.describe_rows(report, name, folder / "oxts" / "timestamps.txt", "GPS/IMU times", packets, needed=True)
+        if len(packets) < rows_needed:
+            report.odd(name, f"{len(packets)} GPS/IMU packets for scans numbered up to {rows_needed - 1}")
+        stamps = folder / "oxts" / "timestamps.txt"
+        layout.describe_rows(report, name, stamps, "GPS/IMU times", max(packets) + 1, needed=True)
         if not (folder.parent / "calib_imu_to_velo.txt").is_file():
             report.missing(name, f"no calibration {folder.parent.name}/calib_imu_to_velo.txt")
 
@@ -208,29 +224,28 @@ class KittiRaw(DataSetOnDisk):
         start, end = (read_timestamps(path, scans.numbers) for path in paths)
         return (start + end) / 2
 
-    def _ground_truth(self, name: str, timestamps: Float[Tensor, "n"]) -> Float[Tensor, "n 4 4"] | None:
-        folder = self._folder(name)
-        packets = _packets(folder)
-        if not len(packets):
-            return None
-        for path in (folder / "oxts" / "timestamps.txt", folder.parent / "calib_imu_to_velo.txt"):
-            if not path.is_file():
-                raise self._lacking(name, path)
-        times = read_timestamps(folder / "oxts" / "timestamps.txt", packets.numbers)
+    def _packet_times(self, name: str, packets: ScanFiles) -> Float[Tensor, "n"]:
+        path = self._folder(name) / "oxts" / "timestamps.txt"
+        if not path.is_file():
+            raise self._lacking(name, path)
+        times = read_timestamps(path, packets.numbers)
         if len(times) < 2 or (times.diff() <= 0).any():
-            raise DamagedFileError(
-                folder / "oxts" / "timestamps.txt", "fewer than two times, or times that do not ascend"
-            )
-        T_lidar_imu = read_rigid_transform(folder.parent / "calib_imu_to_velo.txt")
+            raise DamagedFileError(path, "fewer than two times, or times that do not ascend")
+        return times
+
+    def _poses(
+        self, name: str, packets: ScanFiles, packet_times: Float[Tensor, "n"], timestamps: Float[Tensor, "m"]
+    ) -> Float[Tensor, "m 4 4"]:
+        calibration = self._folder(name).parent / "calib_imu_to_velo.txt"
+        if not calibration.is_file():
+            raise self._lacking(name, calibration)
+        T_lidar_imu = read_rigid_transform(calibration)
         # Only what the scans need: a drive has thousands of packets, one file each.
-        used = (times >= timestamps.min() - 1) & (times <= timestamps.max() + 1)
-        if int(used.sum()) < 2:
-            raise DamagedFileError(
-                folder / "oxts" / "timestamps.txt", "its times do not overlap with those of the scans"
-            )
-        T_world_imu = read_oxts_poses(packets.select(np.flatnonzero(used.numpy()).tolist()))
-        T_world_lidar = T_world_imu @ torch.linalg.inv(T_lidar_imu)
-        return start_at_identity(interpolate_poses(times[used], T_world_lidar, timestamps))
+        first = max(int((packet_times <= timestamps.min()).sum()) - 1, 0)
+        end = int((packet_times < timestamps.max()).sum()) + 1
+        used = range(len(packets))[min(first, len(packets) - 2) : max(first + 2, end)]
+        T_world_lidar = read_oxts_poses(packets.select(used)) @ torch.linalg.inv(T_lidar_imu)
+        return start_at_identity(interpolate_poses(packet_times[list(used)], T_world_lidar, timestamps))
 
     def _lacking(self, name: str, path: Path) -> DataSetNotFoundError:
         return self.not_found(name, str(path.relative_to(self.root)))

@@ -144,7 +144,30 @@ def test_a_check_reads_packets_around_the_first_scan_alone(tmp_path, monkeypatch
     read = []
     monkeypatch.setattr(kitti_raw, "read_oxts_poses", lambda packets: read.append(packets) or read_oxts_poses(packets))
     assert raw(tmp_path).check().usable
-    assert [packets.numbers for packets in read] == [list(range(10))]  # within a second
+    assert [packets.numbers for packets in read] == [[0, 1]]
+
+
+def test_scans_without_packets_have_no_ground_truth_made_up(tmp_path, caplog):
+    written = write_kitti_raw(tmp_path, frames=20)
+    packets = folder(tmp_path) / "oxts" / "data"
+    for number in (0, 1, *range(12, 20)):
+        (packets / f"{number:010d}.txt").unlink()
+    sequence = raw(tmp_path).sequence(DRIVE)
+    assert sequence.scans.numbers == list(range(2, 13))  # scan 12 is 0.09 s after packet 11
+    assert "9 scans before or after the ground truth are left out" in caplog.text
+    poses = np.linalg.inv(written.T_world_lidar[2]) @ written.T_world_lidar[2:13]
+    assert np.allclose(sequence.T_world_lidar, poses, atol=1e-4)
+    assert len(raw(tmp_path, max_frames=3).sequence(DRIVE)) == 3
+    report = raw(tmp_path).check()
+    assert report.usable and "10 GPS/IMU packets for scans numbered up to 19" in details(report, "odd")
+
+
+def test_scans_in_a_hole_of_the_packets_are_told(tmp_path, caplog):
+    write_kitti_raw(tmp_path, frames=40)
+    for number in range(5, 35):
+        (folder(tmp_path) / "oxts" / "data" / f"{number:010d}.txt").unlink()
+    assert len(raw(tmp_path).sequence(DRIVE)) == 40
+    assert "31 scans lie in holes of the ground truth" in caplog.text
 
 
 def test_a_truncated_scan(tmp_path):
