@@ -78,6 +78,16 @@ def test_round_trip(name, tmp_path):
     )
 
 
+@pytest.mark.parametrize("name", ["kitti_00-08", "folder"])
+def test_times_of_a_clock_keep_their_fractions(name, tmp_path):
+    write_folder(tmp_path / "scans", names=("a",), scans=3)
+    (tmp_path / "scans" / "a" / "times.txt").write_text("1700000000.05\n1700000000.15\n1700000000.25\n")
+    drive = target_of("folder", tmp_path / "scans").sequence("a")
+    export(drive, target_of(name, tmp_path / "copy"), "03")
+    read = target_of(name, tmp_path / "copy").sequence("03")
+    torch.testing.assert_close(read.timestamps, drive.timestamps, rtol=0, atol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_an_odometry_makes_the_same_error_on_the_copy(name, tmp_path):

@@ -34,7 +34,7 @@ def write_kitti_odometry(drive: Sequence, target: KittiOdometry, name: str) -> N
     calibration = [*(f"P{camera}: {pinhole}" for camera in range(4)), f"Tr: {matrix_row(T_camera_lidar)}"]
     (folder / "calib.txt").write_text("\n".join(calibration) + "\n", encoding="utf-8")
     (folder / "times.txt").write_text(
-        "".join(f"{time:.9e}\n" for time in timestamps_of(drive).tolist()), encoding="utf-8"
+        "".join(f"{time:.9f}\n" for time in timestamps_of(drive).tolist()), encoding="utf-8"
     )
     if drive.T_world_lidar is not None:
         T_world_camera = T_camera_lidar @ drive.T_world_lidar @ torch.linalg.inv(T_camera_lidar)
