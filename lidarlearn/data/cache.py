@@ -4,6 +4,7 @@ import hashlib
 import json
 import shutil
 import sys
+import warnings
 from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -44,8 +45,8 @@ class VertexMaps:
 
     def __init__(self, *files: Path) -> None:
         self.files = files
-        # "c": as if to be written to, in memory alone, without which torch warns; nothing is written
-        self._maps = [np.load(file, mmap_mode="c") for file in files]
+        # for reading alone: maps that might be written to count as memory, of which they may exceed what there is
+        self._maps = [np.load(file, mmap_mode="r") for file in files]
         self._ends = list(accumulate(map(len, self._maps)))
 
     def __len__(self) -> int:
@@ -74,7 +75,9 @@ class VertexMaps:
 
     def _one(self, row: int) -> Int16[Tensor, "3 h w"]:
         sequence = bisect_right(self._ends, row)
-        return torch.from_numpy(self._maps[sequence][row - self._ends[sequence]])  # counted from its end
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # and nobody writes to it
+            return torch.from_numpy(self._maps[sequence][row - self._ends[sequence]])  # counted from its end
 
 
 def encode(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Int16[Tensor, "*batch 3 h w"]:

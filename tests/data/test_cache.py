@@ -1,6 +1,7 @@
 """The cache of vertex maps: faithful, shared, and made again when it has to be."""
 
 import multiprocessing
+import os
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from lidarlearn.data import cache
-from lidarlearn.data.cache import QUANTUM_M, cached_vertex_maps, decode, encode
+from lidarlearn.data.cache import QUANTUM_M, VertexMaps, cached_vertex_maps, decode, encode
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.sequence import Scan
 from lidarlearn.errors import UserError
@@ -135,6 +136,13 @@ def test_maps_travel_to_workers_as_a_path(tmp_path):
     luggage = pickle.dumps(maps)
     assert len(luggage) < 2000
     torch.testing.assert_close(pickle.loads(luggage)[29], maps[29])
+
+
+def test_maps_may_exceed_the_memory(tmp_path):
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    count = 4 * memory // (2 * 3 * 64 * 1024)
+    np.lib.format.open_memmap(tmp_path / "0.npy", mode="w+", dtype=np.int16, shape=(count, 3, 64, 1024))  # of holes
+    assert not VertexMaps(tmp_path / "0.npy")[torch.tensor([0, count - 1])].any()
 
 
 def _build(root, start, results):
