@@ -1,5 +1,6 @@
 """Point clouds in the formats that tools exchange: .bin, .npy, .pcd and .ply, with the fields that matter here."""
 
+import logging
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.scan_files import read_float32_rows
 from lidarlearn.data.sequence import Scan
+
+_log = logging.getLogger(__name__)
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 _INTENSITY_NAMES = ("intensity", "scalar_intensity", "intensities", "reflectivity", "reflectance")
@@ -54,7 +57,7 @@ def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
         bin_columns: numbers per point of a .bin file: 4 as in KITTI, 5 as in nuScenes.
 
     Raises:
-        DamagedFileError: not such a file, no return in it, or (.bin and .npy) a point that is not finite. In .pcd and
+        DamagedFileError: not such a file, no point in it, or (.bin and .npy) a point that is not finite. In .pcd and
             .ply that is a common way to say "no return".
     """
     match path.suffix.lower():
@@ -87,20 +90,20 @@ def write_ply(path: Path, fields: Mapping[str, NDArray[np.float32]]) -> None:
 
 
 def returns_of(fields: Mapping[str, NDArray[Any]]) -> Cloud:
-    """The returns alone, of all fields those that matter here.
+    """The returns alone, of all fields those that matter here; drivers send whole grids of points without any, too.
 
     Args:
         fields: a value per point under each of the names that tools use, in lower case.
 
     Raises:
-        ValueError: no coordinates, or no return.
+        ValueError: no coordinates, or no points.
     """
     if not {"x", "y", "z"} <= fields.keys():
         raise ValueError(f"no fields x, y and z, only {', '.join(fields) or 'none'}")
     points = torch.from_numpy(np.stack([np.asarray(fields[axis], np.float32) for axis in "xyz"], axis=1))
+    if not len(points):
+        raise ValueError("a scan without a single point")
     returned = points.isfinite().all(dim=1) & (points != 0).any(dim=1)
-    if not returned.any():
-        raise ValueError("a scan without a single return")
     intensities, times = (
         next((torch.from_numpy(np.asarray(fields[n]).astype(dtype))[returned] for n in names if n in fields), None)
         for names, dtype in ((_INTENSITY_NAMES, np.float32), (_TIME_NAMES, np.float64))
@@ -123,8 +126,26 @@ def as_scan(cloud: Cloud, beam_correction_deg: float, max_intensity: float | Non
     return Scan(raise_beams(cloud.points, beam_correction_deg), times, intensities)
 
 
+def note_returns(cloud: Cloud, name: str, index: int, empty: list[int]) -> None:
+    """Note a scan without a single return (a covered lens, a dead driver) and warn of a sequence's first one.
+
+    Args:
+        cloud: as it stands in the file.
+        name: of the sequence.
+        index: of the scan.
+        empty: the scans of the sequence that were noted before.
+    """
+    if len(cloud.points):
+        return
+    if not empty:
+        _log.warning("%s: scan %d has not a single return, and counts as an empty one; others may follow", name, index)
+    empty.append(index)
+
+
 def relative_times(times: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     """Times in any unit as shares of the sweep relative to its middle, within [-0.5, 0.5]; 0 where all are the same."""
+    if not len(times):
+        return times.float()
     first, last = times.min(), times.max()
     period = torch.where(last > first, last - first, 1.0)
     return ((times - (first + last) / 2) / period).float()

@@ -7,7 +7,7 @@ KITTI rows belong to the scans in order; TUM rows are interpolated at the scans'
 are left out, or belong to the scans in order where these have no times. Poses relate to the middle of a sweep.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data import layout
-from lidarlearn.data.cloud_files import SUFFIXES, as_scan, read_cloud
+from lidarlearn.data.cloud_files import SUFFIXES, as_scan, note_returns, read_cloud
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.ground_truth import describe_ground_truth, find_ground_truth, read_ground_truth
 from lidarlearn.data.on_disk import DataSetOnDisk
@@ -38,6 +38,7 @@ class FolderSequence(Sequence):
         bin_columns: numbers per point of a .bin file.
         max_intensity: the value of full reflectance; None leaves intensities out.
         beam_correction_deg: angle by which every beam is raised.
+        empty: scans that were read and had not a single return.
     """
 
     name: str
@@ -47,6 +48,7 @@ class FolderSequence(Sequence):
     bin_columns: int
     max_intensity: float | None
     beam_correction_deg: float
+    empty: list[int] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -54,6 +56,7 @@ class FolderSequence(Sequence):
     def scan(self, index: int) -> Scan:
         """Read one scan, with point times relative to the middle of the sweep where the file has any."""
         cloud = read_cloud(self.scans.path(index), self.bin_columns)
+        note_returns(cloud, self.name, index, self.empty)
         return as_scan(cloud, self.beam_correction_deg, self.max_intensity)
 
     @property

@@ -6,7 +6,7 @@ point's place in the file gives its time. Poses (`sec,nsec,x,y,z,qx,qy,qz,qw`) a
 10 Hz, from registration to a survey-grade map; we interpolate them at the middle of each sweep.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.cloud_files import read_cloud
+from lidarlearn.data.cloud_files import note_returns, read_cloud
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.on_disk import DataSetOnDisk
@@ -49,6 +49,7 @@ class NewerCollegeSequence(Sequence):
         T_world_lidar: ground truth at the middle of each sweep; None where there is none.
         timestamps: middle of each sweep [s].
         beam_correction_deg: angle by which every beam is raised.
+        empty: scans that were read and had not a single return.
     """
 
     name: str
@@ -56,6 +57,7 @@ class NewerCollegeSequence(Sequence):
     T_world_lidar: Float[Tensor, "n 4 4"] | None
     timestamps: Float[Tensor, "n"] | None
     beam_correction_deg: float
+    empty: list[int] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -63,6 +65,7 @@ class NewerCollegeSequence(Sequence):
     def scan(self, index: int) -> Scan:
         """Read one scan, with point times relative to the middle of the sweep; none where columns are missing."""
         cloud = read_cloud(self.scans.path(index))
+        note_returns(cloud, self.name, index, self.empty)
         whole = cloud.file_rows == BEAMS * COLUMNS
         times = (cloud.rows // BEAMS).float() / COLUMNS - 0.5 if whole else None
         return Scan(raise_beams(cloud.points, self.beam_correction_deg), times=times)

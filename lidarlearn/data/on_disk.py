@@ -82,7 +82,8 @@ class DataSetOnDisk(DataSet):
     def _open_all(self, report: LayoutReport) -> None:
         for name in self.names:
             try:
-                remark = misfit(name, self.open_for_check(name).scan(0).points, self.projection)
+                points = self.open_for_check(name).scan(0).points
+                remark = misfit(name, points, self.projection) if len(points) else "its first scan has no return"
             except UserError as problem:
                 report.missing(name, one_line(problem))
             else:

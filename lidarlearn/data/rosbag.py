@@ -11,7 +11,7 @@ are passed over.
 import hashlib
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data.bag_files import Bag, Place, Topic, bag_name, find_bags, list_files
-from lidarlearn.data.cloud_files import as_scan, returns_of
+from lidarlearn.data.cloud_files import as_scan, note_returns, returns_of
 from lidarlearn.data.errors import DamagedFileError, one_line
 from lidarlearn.data.ground_truth import (
     GroundTruth,
@@ -74,6 +74,7 @@ class RosbagSequence(Sequence):
         timestamps: of the middle of each sweep [s]; of its message where points have no times.
         max_intensity: the value of full reflectance; None leaves intensities out.
         beam_correction_deg: angle by which every beam is raised.
+        empty: scans that were read and had not a single return.
     """
 
     name: str
@@ -84,6 +85,7 @@ class RosbagSequence(Sequence):
     timestamps: Float[Tensor, "n"]
     max_intensity: float | None
     beam_correction_deg: float
+    empty: list[int] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.places)
@@ -95,6 +97,7 @@ class RosbagSequence(Sequence):
             cloud = returns_of(fields_of(message))
         except ValueError as error:
             raise DamagedFileError(self.bag.path, f"scan {index} of {self.topic}: {error}") from error
+        note_returns(cloud, self.name, index, self.empty)
         return as_scan(cloud, self.beam_correction_deg, self.max_intensity)
 
     @property
@@ -252,14 +255,16 @@ def _middle_s(
 ) -> float:
     """How long after its time the middle of a sweep is [s], from one amid the recording: drivers begin with a part."""
     amid = len(places) // 2
+    onwards = (*range(amid, len(places)), *range(amid))
     try:
-        times = returns_of(fields_of(bag.message(topic.name, places[amid]))).times
+        clouds = ((i, returns_of(fields_of(bag.message(topic.name, places[i])))) for i in onwards)
+        index, times = next(((i, cloud.times) for i, cloud in clouds if len(cloud.points)), (amid, None))
     except ValueError:  # whoever reads that scan is told
         return 0.0
     if times is None or not (times != times[0]).any():
         return 0.0
     period_s = float(timestamps.diff().median()) if len(timestamps) > 1 else _PERIOD_S
-    return middle_after_stamp(times, None if recorded else float(timestamps[amid]), period_s)
+    return middle_after_stamp(times, None if recorded else float(timestamps[index]), period_s)
 
 
 def _ends_s(bag: Bag, topic: Topic) -> tuple[float, float]:

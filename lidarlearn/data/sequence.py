@@ -15,6 +15,7 @@ from torch import Tensor
 from lidarlearn.data.errors import require_count
 from lidarlearn.data.field_of_view import misfit
 from lidarlearn.data.scan_files import sequence_names
+from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 
 _log = logging.getLogger(__name__)
@@ -72,6 +73,20 @@ class Sequence(ABC):
         Raises:
             DamagedFileError: the file is truncated, empty or holds values that are not finite.
         """
+
+    def first_returns(self) -> Scan:
+        """The first scan with a return, almost always the first of all.
+
+        Raises:
+            UserError: no scan has any.
+        """
+        found = next((scan for scan in self if len(scan.points)), None)
+        if found is None:
+            raise UserError(
+                f"{self.name}: none of its {len(self)} scans has a single return.\n"
+                "  change: data.train_sequences, data.val_sequences and data.test_sequences to leave it out"
+            )
+        return found
 
     @property
     @abstractmethod
@@ -185,9 +200,10 @@ class DataSet(ABC):
 
         Raises:
             DataSetNotFoundError, DamagedFileError: see `sequence`; or the first scan of one cannot be read.
+            UserError: none of the scans of one has a return.
         """
         opened = {name: self.sequence(name) for name in names}
-        remarks = (misfit(name, sequence.scan(0).points, self.projection) for name, sequence in opened.items())
+        remarks = (misfit(name, sequence.first_returns().points, self.projection) for name, sequence in opened.items())
         if remark := next(filter(None, remarks), None):
             _log.warning(remark)
         return opened

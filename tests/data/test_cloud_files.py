@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidarlearn.data.cloud_files import read_cloud, relative_times
+from lidarlearn.data.cloud_files import as_scan, read_cloud, relative_times
 from lidarlearn.data.errors import DamagedFileError
 from tests.data.writers import random_points, write_float32, write_pcd, write_ply
 
@@ -74,12 +74,28 @@ def test_damaged_pcd_and_ply_name_the_file(tmp_path, suffix, damage):
 
 @pytest.mark.parametrize(
     "rows",
-    [np.zeros((0, 4)), np.zeros((4, 4)), np.full((4, 4), np.nan), np.zeros((4, 2)), np.zeros(5), np.array(["a"] * 4)],
+    [np.zeros((0, 4)), np.full((4, 4), np.nan), np.zeros((4, 2)), np.zeros(5), np.array(["a"] * 4)],
 )
 def test_npy_without_points(tmp_path, rows):
     np.save(tmp_path / "scan.npy", rows)
     with pytest.raises(DamagedFileError, match=r"scan\.npy"):
         read_cloud(tmp_path / "scan.npy")
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".npy", ".pcd", ".ply"])
+def test_a_scan_without_a_return_is_an_empty_one(tmp_path, suffix):
+    path, points = tmp_path / f"0{suffix}", np.zeros((200, 3), np.float32)
+    if suffix == ".bin":
+        write_float32(path, points)
+    elif suffix == ".npy":
+        np.save(path, points)
+    else:
+        (write_pcd if suffix == ".pcd" else write_ply)(path, points, TIMES)
+    cloud = read_cloud(path)
+    assert len(cloud.points) == 0 and cloud.file_rows == 200
+    scan = as_scan(cloud, beam_correction_deg=0.2, max_intensity=255.0)
+    assert scan.points.shape == (0, 3)
+    assert (scan.times is not None) == (suffix in (".pcd", ".ply")) and (scan.times is None or len(scan.times) == 0)
 
 
 def test_npy_runs_no_code(tmp_path):

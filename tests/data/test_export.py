@@ -115,6 +115,15 @@ def test_a_folder_in_any_kind_of_file(suffix, tmp_path):
     assert (read.scan(1).times is not None) == (suffix in (".pcd", ".ply"))
 
 
+@pytest.mark.parametrize("name", ["kitti_00-08", "folder"])
+def test_an_empty_scan_keeps_its_place(name, tmp_path):
+    write_folder(tmp_path / "scans", names=("a",), scans=3)
+    write_float32(tmp_path / "scans" / "a" / "0.bin", np.zeros((5, 3)))
+    export(target_of("folder", tmp_path / "scans").sequence("a"), target_of(name, tmp_path / "copy"), "03")
+    read = target_of(name, tmp_path / "copy").sequence("03")
+    assert [len(scan.points[(scan.points != 0).any(dim=1)]) for scan in read] == [0, 200, 200]
+
+
 def write_folder(root, names=("a", "b"), scans=2):
     for name in names:
         for i in range(scans):

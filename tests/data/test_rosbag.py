@@ -15,8 +15,10 @@ import torch
 from lidarlearn.commands import evaluate
 from lidarlearn.commands.data import main
 from lidarlearn.data.bag_files import find_bags
+from lidarlearn.data.cache import cached_vertex_maps
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.errors import UserError
+from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import os1_64
@@ -187,16 +189,35 @@ def test_messages_without_points_are_passed_over(tmp_path):
 
 @pytest.mark.parametrize(
     ("rows", "problem"),
-    [
-        (as_rows(np.full((5, 3), np.nan), PLAIN), "scan 0 of /points: a scan without a single return"),
-        (np.zeros(5, [("range", "<f4"), ("x", "<f4")]), "no fields x, y and z, only range, x"),
-    ],
+    [(np.zeros(5, [("range", "<f4"), ("x", "<f4")]), "no fields x, y and z, only range, x")],
 )
 def test_clouds_that_cannot_be_used(tmp_path, rows, problem):
     write_bag(tmp_path, "street", {"/points": [rows]})
     with pytest.raises(DamagedFileError, match=problem):
         rosbag(tmp_path).sequence("street").scan(0)
     assert not rosbag(tmp_path).check().usable
+
+
+@pytest.mark.parametrize("empty", [(0, 1), (2, 3), (1, 2, 3, 4)])
+def test_scans_without_a_return_are_empty_ones(tmp_path, caplog, empty):
+    clouds = [as_rows(random_points(i) * (i not in empty), OUSTER, t=TIMES_NS) for i in range(5)]
+    write_bag(tmp_path, "street", {"/points": clouds})
+    data = rosbag(tmp_path, deskew=True)
+    assert data.check().usable
+    sequence = data.sequences(["street"])["street"]
+    assert [i for i, scan in enumerate(sequence) if not len(scan.points)] == list(empty)
+    assert np.allclose(sequence.timestamps, 1.6e9 + 0.0495 + 0.1 * np.arange(5), rtol=0, atol=1e-6)
+    caplog.clear()
+    sequence = rosbag(tmp_path).sequence("street")
+    assert len(list(sequence)) == 5 and caplog.text.count("not a single return") == 1
+    maps = cached_vertex_maps(sequence, SphericalProjection(), tmp_path)
+    assert [bool(maps[i].any()) for i in range(5)] == [i not in empty for i in range(5)]
+
+
+def test_a_recording_without_any_return_cannot_be_used(tmp_path):
+    write_bag(tmp_path, "street", {"/points": [as_rows(np.full((5, 3), np.nan), PLAIN)] * 3})
+    with pytest.raises(UserError, match=r"street: none of its 3 scans has a single return(.|\n)*data\.test_sequences"):
+        rosbag(tmp_path).sequences(["street"])
 
 
 def cut_half(path):

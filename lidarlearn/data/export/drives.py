@@ -32,8 +32,8 @@ def write_shared(path: Path, text: str) -> None:
 
 
 def scans_of(drive: Sequence, name: str) -> Iterator[Scan]:
-    """All scans, with their progress shown."""
-    return tracked(drive, f"writing sequence {name}", len(drive))
+    """All scans, with their progress shown; an empty one as a point at the origin, which stands for no return."""
+    return tracked(map(_with_a_point, drive), f"writing sequence {name}", len(drive))
 
 
 def timestamps_of(drive: Sequence) -> Float[Tensor, "n"]:
@@ -57,7 +57,7 @@ def ground_truth_of(drive: Sequence, format_name: str) -> Float[Tensor, "n 4 4"]
 
 def require_compensated(drive: Sequence, format_name: str) -> None:
     """Raise UserError where scans are distorted by motion and the format holds scans that are not."""
-    if drive.scan(0).times is not None:
+    if drive.first_returns().times is not None:
         raise UserError(
             f"{format_name} holds motion-compensated scans, but those of {drive.name} are distorted by motion."
             "\n  change: data.motion_distortion=false for simulated drives, or to=kitti_raw, kitti_360 or folder"
@@ -66,7 +66,7 @@ def require_compensated(drive: Sequence, format_name: str) -> None:
 
 def require_sweeps(drive: Sequence, format_name: str) -> None:
     """Raise UserError unless each point's azimuth tells its time, as the format's readers take it to do."""
-    scan = drive.scan(0)
+    scan = drive.first_returns()
     if scan.times is None:
         raise UserError(
             f"{format_name} holds scans as the motion distorted them, but those of {drive.name} are compensated."
@@ -78,3 +78,11 @@ def require_sweeps(drive: Sequence, format_name: str) -> None:
             f"{format_name} tells a point's time by its azimuth, clockwise from the rear; the times of {drive.name}"
             f" differ from that by up to {difference.abs().max():.2f} sweeps.\n  change: to=folder, which holds times"
         )
+
+
+def _with_a_point(scan: Scan) -> Scan:
+    """The scan, or where it is empty one point at the origin: a file without points would pass for a damaged one."""
+    if len(scan.points):
+        return scan
+    times, intensities = (None if part is None else torch.zeros(1) for part in (scan.times, scan.intensities))
+    return Scan(torch.zeros(1, 3), times, intensities)

@@ -17,7 +17,7 @@ _START_S = 1_583_836_591  # of the first walk
 
 def require_newer_college(drive: Sequence, target: NewerCollege, name: str) -> None:
     """Raise UserError unless points have times, and scans poses."""
-    _columns(drive, drive.scan(0))
+    _columns(drive, drive.first_returns())
     ground_truth_of(drive, target.title)
 
 
