@@ -1,13 +1,15 @@
 """Vertex maps on disk: each scan is read and projected once, then mapped into memory at every epoch."""
 
+import errno
 import hashlib
 import json
+import math
+import os
 import shutil
 import sys
 import warnings
 from bisect import bisect_right
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import asdict
 from itertools import accumulate
 from pathlib import Path
@@ -15,11 +17,11 @@ from typing import Literal
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
 from jaxtyping import Float, Int, Int16
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, default_collate
 
+from lidarlearn.data.locked import locked
 from lidarlearn.data.progress import tracked
 from lidarlearn.data.sequence import Sequence
 from lidarlearn.data.writable import writable
@@ -32,8 +34,9 @@ QUANTUM_M = 0.004
 
 _MAPS, _DONE = "vertex_maps.npy", "done.npy"
 _CHUNK = 32  # frames between two notes of what is done: at most so many are projected again after a kill
-_SPARE_BYTES = 50_000_000
+_SPARE_BYTES = 50_000_000  # that are left to others
 _REMEDY = "datamodule.cache_root=/path/with/room, or the environment variable LIDARLEARN_CACHE"
+_MAKE_ROOM = f"\n  change: {_REMEDY}, or train on fewer scans (data.max_frames)"
 
 
 class VertexMaps:
@@ -114,14 +117,41 @@ def cached_vertex_maps(
         DamagedFileError: a scan cannot be read.
         UserError: the disk is too small, or cannot be written to.
     """
-    folder = cache_root / _fingerprint(sequence, projection)
-    shape = (len(sequence), 3, projection.height, projection.width)
+    folder, shape = _place(sequence, projection, cache_root)
     if not _complete(folder, shape):
         writable(folder, _REMEDY)
-        with _locked(folder / ".lock", sequence.name):
+        with locked(folder / ".lock", f"sequence {sequence.name}: waiting for another process that projects it"):
             if not _complete(folder, shape):
                 _build(folder, shape, sequence, projection, num_workers)
     return VertexMaps(folder / _MAPS)
+
+
+def require_room(sequences: Iterable[Sequence], projection: SphericalProjection, cache_root: Path) -> None:
+    """Raise UserError unless the disk has room for all vertex maps that the sequences still lack."""
+    lacking = sum(_lacking_bytes(*_place(sequence, projection, cache_root)) for sequence in sequences)
+    if not lacking:
+        return
+    free = shutil.disk_usage(writable(cache_root, _REMEDY)).free
+    if free < lacking + _SPARE_BYTES:
+        raise UserError(
+            f"{cache_root.absolute()}: {free / 1e9:.2f} GB are free, and the vertex maps to be made take"
+            f" {lacking / 1e9:.2f} GB, beside {_SPARE_BYTES / 1e9:.2f} GB that are left to others.{_MAKE_ROOM}"
+        )
+
+
+def _place(sequence: Sequence, projection: SphericalProjection, cache_root: Path) -> tuple[Path, tuple[int, ...]]:
+    """Folder of a sequence's cache, and the shape of its vertex maps."""
+    shape = (len(sequence), 3, projection.height, projection.width)
+    return cache_root / _fingerprint(sequence, projection), shape
+
+
+def _lacking_bytes(folder: Path, shape: tuple[int, ...]) -> int:
+    """What a cache will take from the disk beyond what it has."""
+    if _complete(folder, shape):
+        return 0
+    file = folder / _MAPS
+    reserved = file.stat().st_blocks * 512 if _opened(file, shape, np.int16) is not None else 0
+    return max(math.prod(shape) * np.dtype(np.int16).itemsize - reserved, 0)
 
 
 def _fingerprint(sequence: Sequence, projection: SphericalProjection) -> str:
@@ -140,32 +170,20 @@ def _complete(folder: Path, shape: tuple[int, ...]) -> bool:
     return maps is not None and done is not None and bool(done.all())
 
 
-@contextmanager
-def _locked(file: Path, name: str) -> Iterator[None]:
-    """Hold a lock; say so when another process makes this one wait."""
-    lock = FileLock(file)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        print(f"sequence {name}: waiting for another process that projects it", flush=True)
-        lock.acquire()
-    try:
-        yield
-    finally:
-        lock.release()
-
-
 def _build(
     folder: Path, shape: tuple[int, ...], sequence: Sequence, projection: SphericalProjection, num_workers: int
 ) -> None:
     """Project what is missing. Frames are flushed to disk before they are noted as done."""
+    require_room([sequence], projection, folder.parent)
     maps = _opened(folder / _MAPS, shape, np.int16, "r+")
     if maps is None:
         (folder / _DONE).unlink(missing_ok=True)  # it was said of other maps
-        maps = _new(folder / _MAPS, shape, np.int16)
+        maps = np.lib.format.open_memmap(folder / _MAPS, mode="w+", dtype=np.int16, shape=shape)
+    _reserve(folder / _MAPS)
     done = _opened(folder / _DONE, shape[:1], np.bool_, "r+")
     if done is None:
-        done = _new(folder / _DONE, shape[:1], np.bool_)
+        done = np.lib.format.open_memmap(folder / _DONE, mode="w+", dtype=np.bool_, shape=shape[:1])
+    _reserve(folder / _DONE)
     (folder / "settings.json").write_text(
         json.dumps(
             {"sequence": sequence.name, "fingerprint": sequence.fingerprint, "code": _code(sequence)}
@@ -204,16 +222,27 @@ def _opened(file: Path, shape: tuple[int, ...], dtype: type, mode: Literal["r", 
         return None
 
 
-def _new(file: Path, shape: tuple[int, ...], dtype: type) -> np.memmap:
-    """A .npy file of zeros, mapped for writing."""
-    needed = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    free = shutil.disk_usage(file.parent).free
-    if free < needed + _SPARE_BYTES:  # a full disk under a mapped file kills the process without a word
+def _reserve(file: Path) -> None:
+    """Take from the disk what a file needs that is mapped for writing, in which new ones have nothing but holes.
+
+    A disk that fills up under a mapped file kills the process without a word, and other runs fill it at the same time.
+
+    Raises:
+        UserError: there is not so much; the file is deleted.
+    """
+    if not hasattr(os, "posix_fallocate"):  # macOS
+        return
+    try:
+        with file.open("ab") as opened:
+            os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
+    except OSError as error:
+        if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # of a file system that cannot
+            return
+        size = file.stat().st_size
+        file.unlink()
         raise UserError(
-            f"{file.parent.absolute()}: {needed / 1e9:.2f} GB of vertex maps do not fit, {free / 1e9:.2f} GB are free."
-            f"\n  change: {_REMEDY}, or train on fewer scans (data.max_frames)"
-        )
-    return np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=shape)
+            f"{file.absolute()}: its {size / 1e9:.2f} GB cannot be reserved: {error.strerror}.{_MAKE_ROOM}"
+        ) from error
 
 
 class _ProjectedScans(Dataset[tuple[int, Tensor | UserError]]):

@@ -77,13 +77,14 @@ class OdometryDataModule(LightningDataModule):
         Raises:
             DataSetNotFoundError: something that is needed is missing.
             DamagedFileError: a scan, or poses, cannot be read.
-            UserError: a sequence lacks the ground truth that the module `needs_ground_truth` for.
+            UserError: a sequence lacks the ground truth that the module `needs_ground_truth` for, or the disk room.
         """
         self.data.prepare()
         # All are opened first: what is missing or unlabelled is told before minutes of projecting.
         sequences = self.data.sequences(dict.fromkeys([*self.data.train_sequences, *self.data.val_sequences]))
         if self.trainer is not None and getattr(self.trainer.lightning_module, "needs_ground_truth", False):
             _require_ground_truth(sequences)
+        cache.require_room(sequences.values(), self.projection, self.cache_root)
         for sequence in sequences.values():
             self._vertex_maps(sequence)
 

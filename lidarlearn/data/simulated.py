@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from filelock import FileLock
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError, one_line, require_count
+from lidarlearn.data.locked import locked
 from lidarlearn.data.progress import progress
 from lidarlearn.data.sequence import DataSet, LayoutReport, Names, Scan, Sequence
 from lidarlearn.data.writable import writable
@@ -177,7 +177,7 @@ class SimulatedDataSet(DataSet):
         if not any(_missing(self.folder(drive), range(self._wanted(drive))) for drive in drives):
             return
         writable(self.root, "data.root=/path/with/room, or the environment variable LIDARLEARN_DATA")
-        with FileLock(self.root / "simulation.lock"):
+        with locked(self.root / "simulation.lock", f"{self.root}: waiting for another process that simulates"):
             missing = [(d, self.folder(d), _missing(self.folder(d), range(self._wanted(d)))) for d in drives]
             jobs = [job for job in missing if job[2]]
             for drive, _, _ in jobs:

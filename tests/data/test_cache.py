@@ -1,5 +1,6 @@
 """The cache of vertex maps: faithful, shared, and made again when it has to be."""
 
+import errno
 import multiprocessing
 import os
 import pickle
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from lidarlearn.data import cache
-from lidarlearn.data.cache import QUANTUM_M, VertexMaps, cached_vertex_maps, decode, encode
+from lidarlearn.data.cache import QUANTUM_M, VertexMaps, cached_vertex_maps, decode, encode, require_room
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.sequence import Scan
 from lidarlearn.errors import UserError
@@ -129,6 +130,40 @@ def test_a_full_disk_is_told_before_it_kills(tmp_path, monkeypatch):
     monkeypatch.setattr(cache.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(UserError, match=r"datamodule\.cache_root"):
         cached_vertex_maps(CountingSequence(), SMALL, tmp_path)
+
+
+def test_the_room_of_all_maps_is_taken_before_the_first_scan_is_read(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        cached_vertex_maps(CountingSequence(interrupted=0), SMALL, tmp_path)
+    file = next(tmp_path.rglob("vertex_maps.npy")).stat()
+    assert 512 * file.st_blocks >= file.st_size
+
+
+def test_a_disk_that_others_fill_is_told_too(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    sequence = CountingSequence()
+    with monkeypatch.context() as patched:
+        patched.setattr(cache.os, "posix_fallocate", full)
+        with pytest.raises(UserError, match=r"No space left on device\.\n  change: datamodule\.cache_root"):
+            cached_vertex_maps(sequence, SMALL, tmp_path)
+    assert sequence.read == [] and not list(tmp_path.rglob("vertex_maps.npy"))
+    assert len(cached_vertex_maps(sequence, SMALL, tmp_path)) == 7
+
+
+@pytest.mark.parametrize(("maps", "fit"), [(2.9, True), (1.9, False)])
+def test_the_room_is_that_of_what_is_lacking_of_all_sequences(tmp_path, monkeypatch, maps, fit):
+    frames = 7 * 3 * SMALL.height * SMALL.width * 2
+    cached_vertex_maps(BoxSequence("0", frames=7), SMALL, tmp_path)
+    usage = type("usage", (), {"free": int(50_000_000 + maps * frames)})
+    monkeypatch.setattr(cache.shutil, "disk_usage", lambda _: usage)
+    sequences = [BoxSequence(name, frames=7) for name in "012"]
+    if fit:
+        require_room(sequences, SMALL, tmp_path)
+    else:
+        with pytest.raises(UserError, match=r"0\.05 GB are free(.|\n)*0\.05 GB that are left to others"):
+            require_room(sequences, SMALL, tmp_path)
 
 
 def test_maps_travel_to_workers_as_a_path(tmp_path):

@@ -115,6 +115,15 @@ def test_maps_are_kept_on_a_gpu_where_they_take_less_than_half_of_it(tmp_path, m
     assert (next(iter(module.val_dataloader()[0]))["reference"].dim() == 1) == is_kept
 
 
+def test_the_disk_is_found_too_small_before_the_first_sequence_is_projected(tmp_path, monkeypatch):
+    one = 9 * 3 * SMALL.height * SMALL.width * 2
+    usage = SimpleNamespace(free=50_000_000 + 2 * one)
+    monkeypatch.setattr("lidarlearn.data.cache.shutil.disk_usage", lambda _: usage)
+    with pytest.raises(UserError, match=r"datamodule\.cache_root"):
+        make(tmp_path)  # three sequences
+    assert not list(tmp_path.rglob("vertex_maps.npy"))
+
+
 def test_maps_that_do_not_fit_are_told(tmp_path, monkeypatch):
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory")
