@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt16
+from jaxtyping import Bool, Float, UInt16
 
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.simulation import motions
+from lidarlearn.simulation.meshes import merge
 from lidarlearn.simulation.movers import snapshot
 from lidarlearn.simulation.raycasting import RayCaster
 from lidarlearn.simulation.sensors import Sensor
@@ -162,11 +163,14 @@ class Drive(Sequence):
             share = sensor.column_times()[sector].mean() if self.motion_distortion else 0.0
             time = (index + share) * sensor.period
             pose = self.trajectory.at(np.array([time]))[0]
-            mesh = snapshot(self.world.movers, time, pose[:3, 3], sensor.max_range)
-            columns = sector[_seen(mesh.vertices, pose, sensor.azimuths(index)[sector])]
+            meshes = snapshot(self.world.movers, time, pose[:3, 3], sensor.max_range)
+            if not meshes:
+                continue
+            azimuths = sensor.azimuths(index)[sector]
+            columns = sector[np.any([_seen(mesh.vertices, pose, azimuths) for mesh in meshes], axis=0)]
             if len(columns):
                 part = np.ascontiguousarray(rays[:, columns])
-                hits = RayCaster(mesh).cast(part.reshape(-1, 6))
+                hits = RayCaster(merge(meshes)).cast(part.reshape(-1, 6))
                 found = hits.distances.reshape(part.shape[:2])
                 cosine = np.abs(np.einsum("bck,bck->bc", hits.normals.reshape(*part.shape[:2], 3), part[..., 3:]))
                 nearer = found < distances[:, columns]
@@ -179,13 +183,18 @@ def simulator_digest() -> str:
     return source_digest(Path(__file__), within=_SIMULATOR)
 
 
-def _seen(vertices: np.ndarray, pose: np.ndarray, azimuths: np.ndarray) -> np.ndarray:
-    """Which azimuths come within 4 degrees of any vertex, or lie within 30 degrees where it is nearer than 6 m."""
-    local = (vertices - pose[:3, 3]) @ pose[:3, :3]
-    bins = np.zeros(180, dtype=bool)  # of 2 degrees
-    bearing = np.floor((np.arctan2(local[:, 1], local[:, 0]) + np.pi) / (2 * np.pi) * 180).astype(int)
-    near = np.hypot(local[:, 0], local[:, 1]) < 6.0
-    for reach, which in ((2, ~near), (15, near)):
-        for step in range(-reach, reach + 1):
-            bins[(bearing[which] + step) % 180] = True
-    return bins[np.floor((azimuths + np.pi) / (2 * np.pi) * 180).astype(int) % 180]
+def _seen(
+    vertices: Float[np.ndarray, "n 3"], pose: Float[np.ndarray, "4 4"], azimuths: Float[np.ndarray, "columns"]
+) -> Bool[np.ndarray, "columns"]:
+    """Which azimuths may meet a body: from its least to its greatest bearing, all where the sensor lies within it.
+
+    The ends have 4 degrees to spare, 30 where they are nearer than 6 m: columns are cast from poses of their own.
+    """
+    xy = ((vertices - pose[:3, 3]) @ pose[:3, :3])[:, :2]
+    middle = np.arctan2(*xy.mean(axis=0)[::-1])  # within the body: all that is seen of it lies about this bearing
+    bearings = (np.arctan2(xy[:, 1], xy[:, 0]) - middle + np.pi) % (2 * np.pi) - np.pi
+    if np.ptp(bearings) >= np.pi:
+        return np.ones(len(azimuths), dtype=bool)
+    spare = np.radians(np.where(np.hypot(xy[:, 0], xy[:, 1]) < 6.0, 30.0, 4.0))
+    low, high = (bearings - spare).min(), (bearings + spare).max()
+    return (azimuths - middle - low) % (2 * np.pi) <= high - low

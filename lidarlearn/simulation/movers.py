@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from lidarlearn.simulation.meshes import Mesh, merge
+from lidarlearn.simulation.meshes import Mesh
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Mover:
         return self.mesh.moved(centre, float(np.arctan2(front[1] - back[1], front[0] - back[0])))
 
 
-def snapshot(movers: Sequence[Mover], time: float, centre: Float[np.ndarray, "3"], radius: float) -> Mesh:
-    """All movers within `radius` [m] of a point at a time [s], as one mesh."""
+def snapshot(movers: Sequence[Mover], time: float, centre: Float[np.ndarray, "3"], radius: float) -> list[Mesh]:
+    """The meshes of all movers within `radius` [m] of a point at a time [s]."""
     near = []
     for mover in movers:
         position = mover.position(time)
         if position is not None and np.linalg.norm(position - centre) < radius:
             near.append(mover.at(time))
-    return merge(mesh for mesh in near if mesh is not None)
+    return [mesh for mesh in near if mesh is not None]

@@ -10,7 +10,8 @@ from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
-from lidarlearn.simulation.meshes import box
+from lidarlearn.simulation.meshes import box, merge
+from lidarlearn.simulation.movers import Mover
 from lidarlearn.simulation.sensors import Sensor, hdl64
 from lidarlearn.simulation.worlds import PRESETS, World
 
@@ -113,6 +114,26 @@ def test_movers_hide_what_is_behind_them(urban):
         both = (lively > 0) & (still > 0)
         assert (lively != still).any()
         assert (lively[both] <= still[both]).all()
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+@pytest.mark.parametrize("yaw", [0.0, 0.5])
+@pytest.mark.parametrize(
+    ("body", "y"), [(box(14.0, 2.5, 4.0), 4.0), (box(14.0, 2.5, 4.0), -11.0), (box(30.0, 20.0, 5.0), 2.0)]
+)
+def test_what_could_move_looks_like_what_stands_there(body, y, yaw, distorted):
+    """Sides of lorries are two triangles: between their vertices, too; and from within."""
+    turned = body.moved(np.zeros(3), yaw)
+    lane = np.stack([np.linspace(-50, 50, 101), np.full(101, y), np.zeros(101)], axis=1)
+    mover = Mover(turned, lane, np.array([-1.0, 100.0]), np.array([50.0, 50.0]))
+    floor, poses = box(400.0, 400.0, 1.0, base=-1.0), scenes.straight_path(5, 1.5, start=-3.0, yaw_step=0.1)
+    settings = {"poses": poses, "frames": 4, "sensor": CLEAN, "motion_distortion": distorted}
+    moving = Drive(World(floor, (mover,)), **settings)
+    standing = Drive(World(merge([floor, mover.at(0.0)])), **settings)
+    alone = Drive(World(floor), **settings)
+    for i in (0, 2):
+        assert (standing.ranges(i) != alone.ranges(i)).sum() > 500
+        assert (moving.ranges(i) == standing.ranges(i)).all()
 
 
 def test_rays_hit_known_walls_exactly():
