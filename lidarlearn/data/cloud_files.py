@@ -1,24 +1,21 @@
 """Point clouds in the formats that tools exchange: .bin, .npy, .pcd and .ply, with the fields that matter here."""
 
 import logging
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import meshio
-import meshio.ply
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from meshio import ReadError
 from numpy.typing import NDArray
-from pypcd4 import PointCloud
 from torch import Tensor
 
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.pcd import read_pcd
+from lidarlearn.data.ply import read_ply
 from lidarlearn.data.scan_files import read_float32_rows
 from lidarlearn.data.sequence import Scan
 
@@ -27,7 +24,6 @@ _log = logging.getLogger(__name__)
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 _INTENSITY_NAMES = ("intensity", "scalar_intensity", "intensities", "reflectivity", "reflectance")
 _TIME_NAMES = ("t", "time", "timestamp", "time_stamp", "timestamps", "offset_time", "scalar_time", "scalar_timestamp")
-_HEADER_BYTES = 4096  # of a .ply, in which the number of points is looked for
 
 
 @dataclass(frozen=True)
@@ -66,27 +62,15 @@ def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
         case ".npy":
             fields = _read_npy(path)
         case ".pcd":
-            fields = _read_pcd(path)
+            fields = read_pcd(path)
         case ".ply":
-            fields = _read_ply(path)
+            fields = read_ply(path)
         case _:
             raise DamagedFileError(path, f"not one of {', '.join(SUFFIXES)}")
     try:
         return returns_of(fields)
     except ValueError as error:
         raise DamagedFileError(path, str(error)) from error
-
-
-def write_ply(path: Path, fields: Mapping[str, NDArray[np.float32]]) -> None:
-    """Write a cloud as .ply, binary.
-
-    Args:
-        path: the file.
-        fields: x, y, z and any more, a value for each point.
-    """
-    points = np.stack([fields[axis] for axis in "xyz"], axis=1)
-    others = {name: values for name, values in fields.items() if name not in ("x", "y", "z")}
-    meshio.ply.write(path, meshio.Mesh(points, [], point_data=others), binary=True)
 
 
 def returns_of(fields: Mapping[str, NDArray[Any]]) -> Cloud:
@@ -165,34 +149,3 @@ def _read_npy(path: Path) -> dict[str, NDArray[Any]]:
     if not np.isfinite(rows[:, :4]).all():
         raise DamagedFileError(path, "points that are not finite")
     return _columns(rows.astype(np.float32))
-
-
-def _read_pcd(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        cloud = PointCloud.from_path(path)
-    except Exception as error:  # its errors are of many kinds, none of them its own
-        raise DamagedFileError(path, f"no .pcd file, or truncated ({_first_line(error)})") from error
-    _require_points(path, len(cloud.pc_data), cloud.metadata.points)
-    return {name.lower(): cloud.pc_data[name] for name in cloud.fields}
-
-
-def _read_ply(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        mesh = meshio.ply.read(path)
-        with path.open("rb") as file:
-            declared = re.search(rb"element vertex (\d+)", file.read(_HEADER_BYTES))
-    except (ReadError, OSError, ValueError, IndexError, KeyError, TypeError) as error:
-        raise DamagedFileError(path, f"no .ply file, or truncated ({_first_line(error)})") from error
-    if declared is not None:
-        _require_points(path, len(mesh.points), int(declared[1]))
-    axes = {axis: mesh.points[:, i] for i, axis in enumerate("xyz"[: mesh.points.shape[1]])}
-    return axes | {name.lower(): values for name, values in mesh.point_data.items()}
-
-
-def _require_points(path: Path, found: int, declared: int) -> None:
-    if found != declared:
-        raise DamagedFileError(path, f"truncated: {found} points where its header says {declared}")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

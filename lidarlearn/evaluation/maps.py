@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarlearn.data.cloud_files import write_ply
+from lidarlearn.data.ply import write_ply
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3

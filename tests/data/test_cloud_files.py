@@ -4,7 +4,7 @@ import torch
 
 from lidarlearn.data.cloud_files import as_scan, read_cloud, relative_times
 from lidarlearn.data.errors import DamagedFileError
-from tests.data.writers import random_points, write_float32, write_pcd, write_ply
+from tests.data.writers import as_rows, random_points, write_float32, write_pcd, write_ply
 
 TIMES = np.linspace(0, 99_000_000, 200).astype(np.uint32)
 
@@ -62,14 +62,93 @@ def cut_whole_points(path):
 
 @pytest.mark.parametrize("suffix", [".pcd", ".ply"])
 @pytest.mark.parametrize(
-    "damage", [cut, cut_whole_points, lambda p: p.write_bytes(b""), lambda p: p.write_bytes(b"x\n")]
+    ("damage", "problem"),
+    [
+        (cut, "truncated"),
+        (cut_whole_points, "truncated"),
+        (lambda p: p.write_bytes(b""), "the file is empty"),
+        (lambda p: p.write_bytes(b"x\n"), "no .p(cd|ly) file"),
+    ],
 )
-def test_damaged_pcd_and_ply_name_the_file(tmp_path, suffix, damage):
+def test_damaged_pcd_and_ply_name_the_file(tmp_path, suffix, damage, problem):
     path = tmp_path / f"scan{suffix}"
     (write_pcd if suffix == ".pcd" else write_ply)(path, random_points(0), TIMES)
     damage(path)
-    with pytest.raises(DamagedFileError, match=rf"scan\{suffix}"):
+    with pytest.raises(DamagedFileError, match=rf"scan\{suffix}: {problem}"):
         read_cloud(path)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize(
+    ("kind", "dtype"),
+    [("uchar", "u1"), ("uint8", "u1"), ("ushort", "u2"), ("short", "i2"), ("float64", "f8"), ("uint32", "u4")],
+)
+def test_ply_of_every_type_between_other_elements(tmp_path, encoding, kind, dtype):
+    """As PCL writes a camera, meshes have faces, and Open3D mixes the two sets of names."""
+    points, values = random_points(0, 5), [0, 100, 127, 128, 255]
+    header = (
+        f"ply\nformat {encoding} 1.0\nelement camera 2\nproperty float k\nproperty int w\nelement vertex 5\n"
+        f"property float x\nproperty float y\nproperty float z\nproperty {kind} Intensity\nproperty uchar ring\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    path = tmp_path / "0.ply"
+    if encoding == "ascii":
+        rows = [f"{x:.9g}\t{y:.9g}  {z:.9g} {value} 1 \n" for (x, y, z), value in zip(points, values, strict=True)]
+        path.write_text(header + "1 2\n3 4\n" + "".join(rows) + "3 0 1 2\n")
+    else:
+        order = "<" if encoding == "binary_little_endian" else ">"
+        camera = np.zeros(2, [("k", order + "f4"), ("w", order + "i4")])
+        layout = [*((axis, order + "f4") for axis in "xyz"), ("i", order + dtype), ("ring", "u1")]
+        rows = as_rows(points, layout, i=values, ring=1)
+        path.write_bytes(header.encode() + camera.tobytes() + rows.tobytes() + bytes(13))
+    cloud = read_cloud(path)
+    assert np.array_equal(cloud.points, points)
+    assert cloud.intensities is not None and cloud.intensities.tolist() == values
+
+
+def test_a_ply_that_begins_with_lists_is_refused_by_their_name(tmp_path):
+    header = "ply\nformat {} 1.0\nelement face 1\nproperty list uchar int corners\nelement vertex 1\n"
+    (tmp_path / "0.ply").write_text(header.format("binary_little_endian") + "property float x\nend_header\nabcd")
+    with pytest.raises(DamagedFileError, match=r"no \.ply file that can be read \(.*list uchar int corners"):
+        read_cloud(tmp_path / "0.ply")
+
+
+PCD = "VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+@pytest.mark.parametrize(
+    ("usual", "found"),
+    [
+        ("COUNT 1 1 1 1\n", ""),
+        ("VERSION 0.7", "VERSION .6"),
+        ("VERSION", "# Stra\xdfe\nVERSION"),
+        ("SIZE 4 4", "SIZE  4\t4"),
+        ("WIDTH 2", "VIEWPOINT 0 0 0 1 0 0 0\nWIDTH 2"),
+    ],
+)
+def test_pcd_headers_as_the_format_allows(tmp_path, encoding, usual, found):
+    body = b"1 2 3 4\n5 6 7 8\n" if encoding == "ascii" else np.arange(1, 9, dtype="<f4").tobytes()
+    header = f"{PCD}DATA {encoding}\n".replace(usual, found)
+    (tmp_path / "0.pcd").write_bytes(header.encode("latin-1") + body)
+    cloud = read_cloud(tmp_path / "0.pcd")
+    assert cloud.points.tolist() == [[1, 2, 3], [5, 6, 7]] and cloud.intensities.tolist() == [4, 8]
+
+
+@pytest.mark.parametrize("line", ["1 2 3 4 \n", "1\t2\t3\t4\n", "  1  2 3 4\r\n", "1 2 3 4"])
+def test_pcd_in_text_of_a_single_point_and_any_blanks(tmp_path, line):
+    header = PCD.replace("WIDTH 2", "WIDTH 1").replace("POINTS 2", "POINTS 1")
+    (tmp_path / "0.pcd").write_bytes(f"{header}DATA ascii\n{line}".encode())
+    assert read_cloud(tmp_path / "0.pcd").points.tolist() == [[1, 2, 3]]
+
+
+def test_text_with_too_few_points_is_truncated(tmp_path):
+    (tmp_path / "0.pcd").write_text(f"{PCD}DATA ascii\n1 2 3 4\n")
+    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+    (tmp_path / "0.ply").write_text(f"{header}end_header\n1 2 3\n")
+    for name in ("0.pcd", "0.ply"):
+        with pytest.raises(DamagedFileError, match="truncated: 1 points where its header says 2"):
+            read_cloud(tmp_path / name)
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
 from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.cloud_files import write_ply
 from lidarlearn.data.export.drives import PERIOD_S, scans_of, timestamps_of
 from lidarlearn.data.export.kitti import matrix_row
 from lidarlearn.data.folder import Folder
+from lidarlearn.data.ply import write_ply
 from lidarlearn.data.sequence import Sequence
 
 
