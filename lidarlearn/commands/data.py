@@ -1,9 +1,11 @@
 """`python -m lidarlearn.data check|export ...`: describe a copy of a data set, or write it in the format of another."""
 
 import json
+import re
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException, InstantiationException
@@ -21,7 +23,8 @@ _USAGE = """usage:
   python -m lidarlearn.data check data=<data set> [data.root=/path/to/your/copy] [data.<setting>=...]
       says what is there, what is missing and what looks odd
   python -m lidarlearn.data export data=<data set> to=<data set> to.root=DIR [data.<setting>=...] [to.<setting>=...]
-      writes the sequences of the one in the native format of the other; to=folder takes suffix=.bin|.npy|.pcd|.ply"""
+      writes the sequences of the one in the native format of the other; to=folder takes suffix=.bin|.npy|.pcd|.ply,
+      where .bin and .npy hold no point times"""
 _ROLES = ("train", "val", "test")
 
 
@@ -58,8 +61,9 @@ def export_all(overrides: Sequence[str], console: Console) -> bool:
     from lidarlearn.data.export.formats import export, format_of, require_new
 
     suffix = next((o.removeprefix("suffix=") for o in overrides if o.startswith("suffix=")), None)
-    of_target = [o.replace("to", "data", 1) for o in overrides if o.startswith(("to=", "to."))]
-    source = compose_data_set([o for o in overrides if not o.startswith(("to=", "to.", "suffix="))])
+    theirs_alone = ("to=", "to.", "projection@to.")
+    of_target = [re.sub(r"^(projection@)?to\b", r"\1data", o) for o in overrides if o.startswith(theirs_alone)]
+    source = compose_data_set([o for o in overrides if not o.startswith((*theirs_alone, "suffix="))])
     target = compose_data_set(of_target)
     form = format_of(target, suffix)
     theirs = matched_names(source, target)
@@ -75,6 +79,9 @@ def export_all(overrides: Sequence[str], console: Console) -> bool:
     if left_out := [name for name in source.names if name not in theirs]:
         console.print(f"left out, {target.title} has no more names for them: {', '.join(left_out)}", markup=False)
     words = ["python", "train.py", *of_target]
+    if not any("projection" in o.partition("=")[0] for o in of_target):  # scans keep the sensor that they are of
+        ours, default = asdict(source.projection), asdict(target.projection)
+        words += [f"data.projection.{key}={ours[key]}" for key in ours if ours[key] != default[key]]
     for role in _ROLES:
         names = [theirs[name] for name in getattr(source, f"{role}_sequences") if name in theirs]
         words.append(f"data.{role}_sequences={json.dumps(names)}")

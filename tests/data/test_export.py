@@ -108,11 +108,30 @@ def test_an_odometry_makes_the_same_error_on_the_copy(name, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".bin", ".npy", ".pcd", ".ply"])
 def test_a_folder_in_any_kind_of_file(suffix, tmp_path):
-    drive = simulated(hdl64(128), True, frames=2)
+    timed = suffix in (".pcd", ".ply")
+    drive = simulated(hdl64(128), timed, frames=2)
     export(drive, target_of("folder", tmp_path), "drive", suffix=suffix)
     read = target_of("folder", tmp_path).sequence("drive")
     assert torch.equal(read.scan(1).points, drive.scan(1).points)
-    assert (read.scan(1).times is not None) == (suffix in (".pcd", ".ply"))
+    assert (read.scan(1).times is not None) == timed
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".npy"])
+def test_files_without_point_times_are_refused_for_scans_that_have_them(suffix, tmp_path):
+    with pytest.raises(UserError, match=rf"suffix=\{suffix}: (.|\n)*suffix=\.pcd or suffix=\.ply"):
+        export(simulated(hdl64(128), True, frames=2), target_of("folder", tmp_path), "drive", suffix=suffix)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("chosen", [(), ("projection@to.projection=vlp16",), ("to.projection.fov_up_deg=20.5",)])
+def test_the_printed_command_trains_with_the_image_of_the_sensor(chosen, tmp_path, capsys):
+    write_folder(tmp_path / "scans")
+    source = ("data=folder", f"data.root={tmp_path}/scans", "projection@data.projection=hdl32_inverted")
+    assert run(*source, "to=kitti_00-08", f"to.root={tmp_path}/kitti", *chosen) == 0
+    words = shlex.split(capsys.readouterr().out.split("train.py ")[1])
+    given = [word.replace("to.", "data.", 1) for word in chosen]
+    asked_for = compose_data_set(["data=kitti_00-08", *given] if chosen else source)
+    assert compose_data_set(words).projection == asked_for.projection
 
 
 @pytest.mark.parametrize("name", ["kitti_00-08", "folder"])

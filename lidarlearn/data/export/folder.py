@@ -12,6 +12,16 @@ from lidarlearn.data.export.kitti import matrix_row
 from lidarlearn.data.folder import Folder
 from lidarlearn.data.ply import write_ply
 from lidarlearn.data.sequence import Sequence
+from lidarlearn.errors import UserError
+
+
+def require_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd") -> None:
+    """Raise UserError where points have times, and files of the suffix hold none."""
+    if suffix in (".bin", ".npy") and drive.first_returns().times is not None:
+        raise UserError(
+            f"suffix={suffix}: such files hold no point times, but the scans of {drive.name} have some."
+            "\n  change: suffix=.pcd or suffix=.ply"
+        )
 
 
 def write_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd") -> None:

@@ -2,12 +2,12 @@
 
 import glob
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from lidarlearn.data.cloud_files import SUFFIXES
-from lidarlearn.data.export.folder import write_folder
+from lidarlearn.data.export.folder import require_folder, write_folder
 from lidarlearn.data.export.ford_campus import require_ford_campus, write_ford_campus
 from lidarlearn.data.export.kitti import require_kitti_odometry, write_kitti_odometry
 from lidarlearn.data.export.kitti_360 import require_kitti_360, write_kitti_360
@@ -45,10 +45,6 @@ class Format:
     places: tuple[str, ...] = ("{}",)
 
 
-def _anything(drive: Sequence, target: Any, name: str) -> None:
-    """A folder of scans holds every drive."""
-
-
 _FORMATS: dict[type[DataSet], Format] = {
     KittiOdometry: Format(
         "kitti_00-08", require_kitti_odometry, write_kitti_odometry, ("sequences/{}", "poses/{}.txt")
@@ -58,7 +54,7 @@ _FORMATS: dict[type[DataSet], Format] = {
     FordCampus: Format("ford_campus", require_ford_campus, write_ford_campus),
     Nclt: Format("nclt", require_nclt, write_nclt, ("{}", "ground_truth/groundtruth_{}.csv")),
     NewerCollege: Format("newer_college", require_newer_college, write_newer_college),
-    Folder: Format("folder", _anything, write_folder, ("{}", "{}.txt", "{}.tum")),
+    Folder: Format("folder", require_folder, write_folder, ("{}", "{}.txt", "{}.tum")),
 }
 
 
@@ -79,12 +75,9 @@ def export(drive: Sequence, target: DataSet, name: str, suffix: str | None = Non
     """
     form = format_of(target, suffix)
     form.require(drive, target, name)
-    write = form.write
     require_new(target, name)
     writable(target.root, _REMEDY)
-    if suffix is not None:
-        write = partial(write_folder, suffix=suffix)
-    write(drive, target, name)
+    form.write(drive, target, name)
 
 
 def format_of(target: DataSet, suffix: str | None = None) -> Format:
@@ -101,7 +94,9 @@ def format_of(target: DataSet, suffix: str | None = None) -> Format:
         raise UserError(f"{target.title} has its own kind of files.\n  change: leave out suffix={suffix}, or to=folder")
     if suffix is not None and suffix not in SUFFIXES:
         raise UserError(f"scans cannot be written as {suffix!r}.\n  change: suffix={'|'.join(SUFFIXES)}")
-    return form
+    if suffix is None:
+        return form
+    return replace(form, require=partial(require_folder, suffix=suffix), write=partial(write_folder, suffix=suffix))
 
 
 def require_new(target: DataSet, name: str) -> None:
