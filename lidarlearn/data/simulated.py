@@ -1,12 +1,9 @@
 """Simulated drives, kept on disk as range images."""
 
-import copy
 import json
 import os
 import re
-import threading
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +11,7 @@ import torch
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError, one_line, require_count
 from lidarlearn.data.locked import locked
-from lidarlearn.data.progress import progress
+from lidarlearn.data.range_images import image_path, make_images, missing_images
 from lidarlearn.data.sequence import DataSet, LayoutReport, Names, Scan, Sequence
 from lidarlearn.data.writable import writable
 from lidarlearn.errors import UserError
@@ -151,7 +148,7 @@ class SimulatedDataSet(DataSet):
         """
         drive = self._drive(name)
         folder, frames = self.folder(drive), self._wanted(drive)
-        missing = _missing(folder, range(frames))
+        missing = missing_images(folder, range(frames))
         if missing:
             raise DataSetNotFoundError(self.title, f"scan {missing[0]} of sequence {name}", folder, _SOURCE)
         return SimulatedSequence(drive, folder, frames)
@@ -166,7 +163,7 @@ class SimulatedDataSet(DataSet):
                 report.missing(name, one_line(problem))
                 continue
             frames = self._wanted(drive)
-            made = frames - len(_missing(self.folder(drive), range(frames)))
+            made = frames - len(missing_images(self.folder(drive), range(frames)))
             note = report.found if made == frames else report.odd
             note(name, f"{made} of {frames} scans in {self.folder(drive)}" + ("" if made == frames else "; " + _SOURCE))
         return report
@@ -174,16 +171,16 @@ class SimulatedDataSet(DataSet):
     def prepare(self, names: Iterable[str] | None = None) -> None:
         """Make the scans that are missing and show the progress; safe when two processes do it, or one is killed."""
         drives = [self._drive(name) for name in (self.names if names is None else dict.fromkeys(names))]
-        if not any(_missing(self.folder(drive), range(self._wanted(drive))) for drive in drives):
+        if not any(missing_images(self.folder(drive), range(self._wanted(drive))) for drive in drives):
             return
         writable(self.root, "data.root=/path/with/room, or the environment variable LIDARLEARN_DATA")
         with locked(self.root / "simulation.lock", f"{self.root}: waiting for another process that simulates"):
-            missing = [(d, self.folder(d), _missing(self.folder(d), range(self._wanted(d)))) for d in drives]
+            missing = [(d, self.folder(d), missing_images(self.folder(d), range(self._wanted(d)))) for d in drives]
             jobs = [job for job in missing if job[2]]
             for drive, _, _ in jobs:
                 self._describe(drive)
             if jobs:
-                _make(jobs, self.workers)
+                make_images(jobs, self.workers)
 
     def folder(self, drive: Drive) -> Path:
         """Where the range images of a drive lie: with all that the same code of the simulator made."""
@@ -219,53 +216,3 @@ class SimulatedDataSet(DataSet):
         settings = {"world": drive.world_name, "seed": drive.seed, "frames": len(drive), "sensor": drive.sensor.name}
         settings |= {"columns": drive.sensor.columns, "static": self.static, "speed": self.speed}
         (folder / "settings.json").write_text(json.dumps(settings, indent=2), encoding="utf-8")
-
-
-def image_path(folder: Path, index: int) -> Path:
-    """File of one range image."""
-    return folder / f"{index:06d}.npy"
-
-
-def _missing(folder: Path, indices: Iterable[int]) -> list[int]:
-    """Those of the scans that have no file yet."""
-    there = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
-    return [i for i in indices if image_path(folder, i).name not in there]
-
-
-_Job = tuple[Drive, Path, list[int]]
-
-
-def _make(jobs: list[_Job], workers: int) -> None:
-    """Simulate and write the scans of all jobs, each one drive; drives are shared out where workers would be idle."""
-    parts = max(1, workers // len(jobs))
-    portions = [(drive, folder, indices[k::parts]) for drive, folder, indices in jobs for k in range(parts)]
-    total = sum(len(indices) for _, _, indices in jobs)
-    stop = threading.Event()
-    # Threads do, and need no importable main module: ray casting and numpy's loops run without the interpreter's lock.
-    what = f"simulating {len(jobs)} drive{'s' if len(jobs) > 1 else ''}"
-    with progress(what, total) as advance, ThreadPoolExecutor(max(1, workers)) as pool:
-        running = {pool.submit(_work, portion, stop, advance) for portion in portions}
-        try:
-            for future in as_completed(running):
-                future.result()
-        finally:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
-
-
-def _work(job: _Job, stop: threading.Event, advance: Callable[[], None]) -> None:
-    drive, folder, indices = copy.copy(job[0]), job[1], job[2]  # the copy's world is let go at the end
-    for index in indices:
-        if stop.is_set():
-            return
-        _write(drive, folder, index)
-        advance()
-
-
-def _write(drive: Drive, folder: Path, index: int) -> None:
-    """Write one range image so that it is either whole or not there."""
-    path = image_path(folder, index)
-    draft = path.with_suffix(".tmp")
-    with draft.open("wb") as file:
-        np.save(file, drive.ranges(index))
-    draft.replace(path)

@@ -90,6 +90,10 @@ class Drive(Sequence):
         """Without what Open3D holds and what can be made anew."""
         return {key: value for key, value in self.__dict__.items() if key not in ("_caster", "world")}
 
+    def build(self) -> None:
+        """Build the world at once, not with the first scan: from then on several threads may make scans."""
+        self._caster.cast(np.ones((1, 6), dtype=np.float32))  # Open3D completes a scene when it is first cast into
+
     def scan(self, index: int) -> Scan:
         """Simulate one scan; its times are given when it is distorted by motion."""
         points, times = self.sensor.points(self.ranges(index), index)

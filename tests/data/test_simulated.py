@@ -1,17 +1,22 @@
 import os
+import threading
+import time
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.simulated import SimulatedDataSet, image_path
+from lidarlearn.data.range_images import image_path
+from lidarlearn.data.simulated import SimulatedDataSet
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.sensors import hdl64
-from lidarlearn.simulation.worlds import PRESETS
+from lidarlearn.simulation.worlds import PRESETS, build_world
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -96,9 +101,36 @@ def test_an_interrupted_run_is_taken_up_where_it_stopped(made, tmp_path):
     assert _bytes(data_set) == _bytes(made)
 
 
+def test_the_world_of_a_drive_is_built_once_for_all_workers_and_let_go(tmp_path, monkeypatch):
+    built = []
+
+    def build(*settings):
+        world = build_world(*settings)
+        built.append(weakref.ref(world))
+        return world
+
+    monkeypatch.setattr("lidarlearn.simulation.drive.build_world", build)
+    _data_set(tmp_path, workers=4, val_sequences=[], test_sequences=[]).prepare()
+    assert len(built) == 1 and built[0]() is None
+
+
+def test_who_waits_for_another_process_is_told(tmp_path, capsys):
+    data = _data_set(tmp_path, val_sequences=[], test_sequences=[])
+    with FileLock(tmp_path / "simulation.lock"):
+        waiting = threading.Thread(target=data.prepare)
+        waiting.start()
+        printed = ""
+        while waiting.is_alive() and "waiting for another process that simulates" not in printed:
+            printed += capsys.readouterr().out
+            time.sleep(0.01)
+        assert waiting.is_alive()
+    waiting.join()
+    assert len(data.sequence("urban_00")) == 4
+
+
 def test_a_failure_while_making_is_not_swallowed(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "lidarlearn.data.simulated.image_path", lambda folder, index: folder / "nowhere" / f"{index}.npy"
+        "lidarlearn.data.range_images.image_path", lambda folder, index: folder / "nowhere" / f"{index}.npy"
     )
     with pytest.raises(FileNotFoundError):
         _data_set(tmp_path, workers=2).prepare()
