@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -17,7 +17,9 @@ from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.pcd import read_pcd
 from lidarlearn.data.ply import read_ply
 from lidarlearn.data.scan_files import read_float32_rows
-from lidarlearn.data.sequence import Scan
+from lidarlearn.data.sequence import Scan, Sequence
+from lidarlearn.data.sweep_stamps import varied
+from lidarlearn.errors import UserError
 
 _log = logging.getLogger(__name__)
 
@@ -43,6 +45,12 @@ class Cloud:
     times: Float[Tensor, "n"] | None
     rows: Int[Tensor, "n"]
     file_rows: int
+
+    def select(self, chosen: Bool[Tensor, "n"]) -> "Cloud":
+        """Some of the points."""
+        intensities = None if self.intensities is None else self.intensities[chosen]
+        times = None if self.times is None else self.times[chosen]
+        return Cloud(self.points[chosen], intensities, times, self.rows[chosen], self.file_rows)
 
 
 def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
@@ -87,26 +95,34 @@ def returns_of(fields: Mapping[str, NDArray[Any]]) -> Cloud:
     points = torch.from_numpy(np.stack([np.asarray(fields[axis], np.float32) for axis in "xyz"], axis=1))
     if not len(points):
         raise ValueError("a scan without a single point")
-    returned = points.isfinite().all(dim=1) & (points != 0).any(dim=1)
     intensities, times = (
-        next((torch.from_numpy(np.asarray(fields[n]).astype(dtype))[returned] for n in names if n in fields), None)
+        next((torch.from_numpy(np.asarray(fields[n]).astype(dtype)) for n in names if n in fields), None)
         for names, dtype in ((_INTENSITY_NAMES, np.float32), (_TIME_NAMES, np.float64))
     )
-    return Cloud(points[returned], intensities, times, returned.nonzero()[:, 0], len(points))
+    returned = points.isfinite().all(dim=1) & (points != 0).any(dim=1)
+    if times is not None:
+        returned &= times.isfinite()
+    return Cloud(points, intensities, times, torch.arange(len(points)), len(points)).select(returned)
 
 
-def as_scan(cloud: Cloud, beam_correction_deg: float, max_intensity: float | None) -> Scan:
+def as_scan(
+    cloud: Cloud, beam_correction_deg: float, max_intensity: float | None, shares_per_unit: float | None = None
+) -> Scan:
     """The scan that a file holds, with point times relative to the middle of the sweep where there are any.
 
     Args:
         cloud: as it stands in the file.
         beam_correction_deg: angle by which every beam is raised.
         max_intensity: the value of full reflectance; None leaves intensities out.
+        shares_per_unit: of the scan period, in a unit of the points' times: points a period away from the others are
+            left out, their times are none. None where that is unknown: a sweep is taken to last for a period.
     """
+    if cloud.times is not None and shares_per_unit is not None and len(cloud.points):
+        cloud = cloud.select((cloud.times - cloud.times.median()).abs() * shares_per_unit < 1)
     intensities = None
     if max_intensity is not None and cloud.intensities is not None:
         intensities = (cloud.intensities / max_intensity).clamp(0, 1)
-    times = None if cloud.times is None else relative_times(cloud.times)
+    times = None if cloud.times is None else relative_times(cloud.times, shares_per_unit)
     return Scan(raise_beams(cloud.points, beam_correction_deg), times, intensities)
 
 
@@ -126,13 +142,31 @@ def note_returns(cloud: Cloud, name: str, index: int, empty: list[int]) -> None:
     empty.append(index)
 
 
-def relative_times(times: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Times in any unit as shares of the sweep relative to its middle, within [-0.5, 0.5]; 0 where all are the same."""
+def relative_times(times: Float[Tensor, "n"], shares_per_unit: float | None = None) -> Float[Tensor, "n"]:
+    """Times as shares of the scan period relative to the middle of the sweep; 0 where all are the same.
+
+    Args:
+        times: in any unit.
+        shares_per_unit: of the period, in one of them; None where that is unknown: the sweep lasts for the period.
+    """
     if not len(times):
         return times.float()
     first, last = times.min(), times.max()
-    period = torch.where(last > first, last - first, 1.0)
-    return ((times - (first + last) / 2) / period).float()
+    if shares_per_unit is None:
+        shares_per_unit = 1 / float(last - first) if last > first else 0.0
+    return ((times - (first + last) / 2) * shares_per_unit).float()
+
+
+def require_point_times(sequence: Sequence, where: str) -> None:
+    """Raise UserError where the points of the first scan with a return have no times, or all the same.
+
+    Args:
+        sequence: that is to be deskewed.
+        where: its scans are, for the message.
+    """
+    scan = next((scan for scan in sequence if len(scan.points)), None)
+    if scan is not None and (scan.times is None or not varied(scan.times)):
+        raise UserError(f"{where}: no point times to deskew with, or all the same.\n  change: data.deskew=false")
 
 
 def _columns(rows: NDArray[np.float32]) -> dict[str, NDArray[Any]]:

@@ -4,7 +4,8 @@ On disk: either every subfolder with scans in it is a sequence, or the folder it
 may have `times.txt` (a time [s] per scan) and ground truth of the LiDAR's own poses, in KITTI's or TUM's format:
 `poses.txt`, `poses.tum`, `groundtruth.txt` with the scans, or `<sequence>.txt`, `<sequence>.tum` beside its folder.
 KITTI rows belong to the scans in order; TUM rows are interpolated at the scans' times, where scans before or after them
-are left out, or belong to the scans in order where these have no times. Poses relate to the middle of a sweep.
+are left out, or belong to the scans in order where these have no times. Poses relate to the middle of a sweep. The
+scans' times tell the scan period, too, of which the points' times take a share.
 """
 
 from dataclasses import dataclass, field
@@ -15,13 +16,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data import layout
-from lidarlearn.data.cloud_files import SUFFIXES, as_scan, note_returns, read_cloud
+from lidarlearn.data.cloud_files import SUFFIXES, as_scan, note_returns, read_cloud, require_point_times
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.ground_truth import describe_ground_truth, find_ground_truth, read_ground_truth
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import read_numbers
 from lidarlearn.data.scan_files import ScanFiles, holds_scans, list_scans, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sweep_stamps import sweep_clock
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 
@@ -35,6 +37,7 @@ class FolderSequence(Sequence):
         scans: its files.
         T_world_lidar: ground truth; None where there is none.
         timestamps: from times.txt [s]; None where there is none.
+        shares_per_unit: of the scan period, in a unit of the points' times; None where that is unknown.
         bin_columns: numbers per point of a .bin file.
         max_intensity: the value of full reflectance; None leaves intensities out.
         beam_correction_deg: angle by which every beam is raised.
@@ -45,6 +48,7 @@ class FolderSequence(Sequence):
     scans: ScanFiles
     T_world_lidar: Float[Tensor, "n 4 4"] | None
     timestamps: Float[Tensor, "n"] | None
+    shares_per_unit: float | None
     bin_columns: int
     max_intensity: float | None
     beam_correction_deg: float
@@ -57,13 +61,14 @@ class FolderSequence(Sequence):
         """Read one scan, with point times relative to the middle of the sweep where the file has any."""
         cloud = read_cloud(self.scans.path(index), self.bin_columns)
         note_returns(cloud, self.name, index, self.empty)
-        return as_scan(cloud, self.beam_correction_deg, self.max_intensity)
+        return as_scan(cloud, self.beam_correction_deg, self.max_intensity, self.shares_per_unit)
 
     @property
     def fingerprint(self) -> str:
         """Digest of the files and of all settings."""
         return self.scans.fingerprint(
             "Folder",
+            shares_per_unit=self.shares_per_unit,
             bin_columns=self.bin_columns,
             max_intensity=self.max_intensity,
             beam_correction_deg=self.beam_correction_deg,
@@ -120,22 +125,24 @@ class Folder(DataSetOnDisk):
             raise UserError(
                 f"{folder}: scans of several kinds ({', '.join(kinds)}).\n  change: keep one kind in a folder"
             )
-        if self.deskew and read_cloud(files.path(0), self.bin_columns).times is None:
-            raise UserError(f"{files.path(0)}: no point times to deskew with.\n  change: data.deskew=false")
         timestamps = _timestamps(folder, len(files))
         posed, truth = None, find_ground_truth(folder)
         if truth is not None:
             posed = read_ground_truth(truth).of_scans(name, range(len(files)), len(files), timestamps)
         chosen = (range(len(files)) if posed is None else posed.indices)[: self.max_frames]
-        return FolderSequence(
+        sequence = FolderSequence(
             name=name,
             scans=files.select(chosen),
             T_world_lidar=None if posed is None else posed.T_world_lidar[: len(chosen)],
             timestamps=None if timestamps is None else timestamps[list(chosen)],
+            shares_per_unit=self._shares_per_unit(files, timestamps),
             bin_columns=self.bin_columns,
             max_intensity=self.max_intensity,
             beam_correction_deg=self.beam_correction_deg,
         )
+        if self.deskew:
+            require_point_times(sequence, str(files.path(0)))
+        return sequence
 
     @staticmethod
     def is_root(path: Path) -> bool:
@@ -160,6 +167,17 @@ class Folder(DataSetOnDisk):
         if (folder / "times.txt").is_file():
             layout.describe_rows(report, name, folder / "times.txt", "times", len(scans))
         describe_ground_truth(report, name, find_ground_truth(folder))
+
+    def _shares_per_unit(self, files: ScanFiles, timestamps: Float[Tensor, "n"] | None) -> float | None:
+        """Of the scan period, in a unit of the points' times, by the file amid the recording."""
+        if timestamps is None or len(files) < 2 or _kinds(files) not in ([".pcd"], [".ply"]):
+            return None
+        period_s = float(timestamps.diff().median())
+        try:
+            times = read_cloud(files.path(len(files) // 2)).times
+        except UserError:  # whoever reads that scan is told
+            return None
+        return None if times is None else sweep_clock(times, 0.0, period_s, period_s).shares_per_unit
 
     def _folder(self, name: str) -> Path:
         folder = self.root / name

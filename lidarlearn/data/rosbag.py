@@ -13,14 +13,13 @@ import logging
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data.bag_files import Bag, Place, Topic, bag_name, find_bags, list_files
-from lidarlearn.data.cloud_files import as_scan, note_returns, returns_of
+from lidarlearn.data.bag_clouds import ends_s, read_clouds
+from lidarlearn.data.bag_files import Bag, Place, bag_name, find_bags, list_files
+from lidarlearn.data.cloud_files import as_scan, note_returns, require_point_times, returns_of
 from lidarlearn.data.errors import DamagedFileError, one_line
 from lidarlearn.data.ground_truth import (
     GroundTruth,
@@ -31,34 +30,12 @@ from lidarlearn.data.ground_truth import (
 )
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.point_cloud2 import fields_of
-from lidarlearn.data.progress import tracked
 from lidarlearn.data.scan_files import ScanFiles
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
-from lidarlearn.data.sweep_stamps import ascending, middle_after_stamp
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 
 _log = logging.getLogger(__name__)
-
-_LEAST_ASCENDING = 0.9  # of the headers' times, for them to be used
-_PERIOD_S = 0.1  # of a sweep where there is but one
-
-
-@dataclass(frozen=True)
-class _Clouds:
-    """Clouds of a topic whose times ascend.
-
-    Args:
-        places: where in the bag each is.
-        timestamps: of each [s].
-        rows: the rank of each among all clouds.
-        count: of all clouds; None where not all were read.
-    """
-
-    places: tuple[Place, ...]
-    timestamps: Float[Tensor, "n"]
-    rows: list[int]
-    count: int | None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,6 +49,7 @@ class RosbagSequence(Sequence):
         places: where in the bag each cloud is.
         T_world_lidar: ground truth; None where there is none.
         timestamps: of the middle of each sweep [s]; of its message where points have no times.
+        shares_per_unit: of the scan period, in a unit of the points' times; None where that is unknown.
         max_intensity: the value of full reflectance; None leaves intensities out.
         beam_correction_deg: angle by which every beam is raised.
         empty: scans that were read and had not a single return.
@@ -83,6 +61,7 @@ class RosbagSequence(Sequence):
     places: tuple[Place, ...]
     T_world_lidar: Float[Tensor, "n 4 4"] | None
     timestamps: Float[Tensor, "n"]
+    shares_per_unit: float | None
     max_intensity: float | None
     beam_correction_deg: float
     empty: list[int] = field(default_factory=list)
@@ -98,12 +77,12 @@ class RosbagSequence(Sequence):
         except ValueError as error:
             raise DamagedFileError(self.bag.path, f"scan {index} of {self.topic}: {error}") from error
         note_returns(cloud, self.name, index, self.empty)
-        return as_scan(cloud, self.beam_correction_deg, self.max_intensity)
+        return as_scan(cloud, self.beam_correction_deg, self.max_intensity, self.shares_per_unit)
 
     @property
     def fingerprint(self) -> str:
         """Digest of the settings, of all times, and of the first, the middle and the last cloud."""
-        settings = (self.topic, self.max_intensity, self.beam_correction_deg, self.places)
+        settings = (self.topic, self.max_intensity, self.beam_correction_deg, self.shares_per_unit, self.places)
         digest = hashlib.sha256(repr(("Rosbag", settings)).encode())
         digest.update(self.timestamps.numpy().tobytes())
         for index in sorted({0, len(self) // 2, len(self) - 1}):
@@ -170,7 +149,7 @@ class Rosbag(DataSetOnDisk):
 
     def _open(self, name: str, bag: Bag, max_frames: int | None, truth: GroundTruth | None) -> RosbagSequence:
         topic = bag.cloud_topic(self.topic)
-        clouds = _read_clouds(name, bag, topic, max_frames, -math.inf if truth is None else truth.start_s)
+        clouds = read_clouds(name, bag, topic, max_frames, -math.inf if truth is None else truth.start_s)
         posed = None if truth is None else truth.of_scans(name, clouds.rows, clouds.count, clouds.timestamps)
         chosen = list(range(len(clouds.places)) if posed is None else posed.indices)[:max_frames]
         sequence = RosbagSequence(
@@ -180,11 +159,12 @@ class Rosbag(DataSetOnDisk):
             places=tuple(clouds.places[i] for i in chosen),
             T_world_lidar=None if posed is None else posed.T_world_lidar[: len(chosen)],
             timestamps=clouds.timestamps[chosen],
+            shares_per_unit=clouds.shares_per_unit,
             max_intensity=self.max_intensity,
             beam_correction_deg=self.beam_correction_deg,
         )
-        if self.deskew and sequence.scan(0).times is None:
-            raise UserError(f"{bag.path}: no point times in {topic.name} to deskew with.\n  change: data.deskew=false")
+        if self.deskew:
+            require_point_times(sequence, f"{bag.path}, {topic.name}")
         return sequence
 
     @staticmethod
@@ -210,7 +190,7 @@ class Rosbag(DataSetOnDisk):
             path = find_ground_truth(bag.path, name)
             describe_ground_truth(report, name, path)
             if path is not None:
-                describe_coverage(report, name, read_ground_truth(path), clouds.count, *_ends_s(bag, clouds))
+                describe_coverage(report, name, read_ground_truth(path), clouds.count, *ends_s(bag, clouds))
         except UserError as problem:
             report.missing(name, one_line(problem))
 
@@ -219,61 +199,3 @@ class Rosbag(DataSetOnDisk):
         if name not in bags:
             raise self.not_found(name, f"a bag called {name}")
         return Bag(bags[name])
-
-
-def _read_clouds(name: str, bag: Bag, topic: Topic, max_frames: int | None, start_s: float) -> _Clouds:
-    """The first clouds; of those stamped before `start_s` as many more as there are."""
-    messages = bag.messages(topic.name)
-    if max_frames != 1:  # one is there at once
-        messages = tracked(messages, f"reading the times of {name}", min(topic.count, max_frames or topic.count))
-    places, stamps, wanted = [], [], 0
-    for place, message in messages:
-        if message.width * message.height == 0:
-            continue
-        places.append(place)
-        stamps.append(_header_s(message))
-        wanted += (stamps[-1] or 1e-9 * place.time_ns) >= start_s
-        if wanted == max_frames:
-            break
-    if not places:
-        raise DamagedFileError(bag.path, f"no message of {topic.name} has points")
-    rows = ascending(stamps)
-    if recorded := len(rows) < _LEAST_ASCENDING * len(stamps):
-        _log.warning("%s: the times in the headers of %s do not ascend, those of recording are used", name, topic.name)
-        rows, stamps = list(range(len(places))), [1e-9 * place.time_ns for place in places]
-    elif len(rows) < len(stamps):
-        left_out = len(stamps) - len(rows)
-        _log.warning("%s: %d clouds of %s with a time out of order are left out", name, left_out, topic.name)
-    timestamps = torch.tensor([stamps[row] for row in rows], dtype=torch.float64)
-    chosen = tuple(places[row] for row in rows)
-    timestamps = timestamps + _middle_s(bag, topic, chosen, timestamps, recorded)
-    return _Clouds(chosen, timestamps, rows, None if wanted == max_frames else len(places))
-
-
-def _middle_s(
-    bag: Bag, topic: Topic, places: tuple[Place, ...], timestamps: Float[Tensor, "n"], recorded: bool
-) -> float:
-    """How long after its time the middle of a sweep is [s], from one amid the recording: drivers begin with a part."""
-    amid = len(places) // 2
-    onwards = (*range(amid, len(places)), *range(amid))
-    try:
-        clouds = ((i, returns_of(fields_of(bag.message(topic.name, places[i])))) for i in onwards)
-        index, times = next(((i, cloud.times) for i, cloud in clouds if len(cloud.points)), (amid, None))
-    except ValueError:  # whoever reads that scan is told
-        return 0.0
-    if times is None or not (times != times[0]).any():
-        return 0.0
-    period_s = float(timestamps.diff().median()) if len(timestamps) > 1 else _PERIOD_S
-    return middle_after_stamp(times, None if recorded else float(timestamps[index]), period_s)
-
-
-def _ends_s(bag: Bag, topic: Topic) -> tuple[float, float]:
-    """Times of the first and the last cloud [s]: those of the headers, or where these do not ascend, of recording."""
-    (first_ns, first), (last_ns, last) = bag.ends(topic.name)
-    first_s, last_s = _header_s(first), _header_s(last)
-    usable = first_s < last_s or (topic.count == 1 and first_s > 0)
-    return (first_s, last_s) if usable else (1e-9 * first_ns, 1e-9 * last_ns)
-
-
-def _header_s(message: Any) -> float:
-    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec

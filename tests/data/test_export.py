@@ -134,6 +134,14 @@ def test_the_printed_command_trains_with_the_image_of_the_sensor(chosen, tmp_pat
     assert compose_data_set(words).projection == asked_for.projection
 
 
+@pytest.mark.parametrize("period", [0.1, 0.05])
+def test_times_of_points_and_scans_agree_in_a_folder(period, tmp_path):
+    drive = simulated(replace(hdl64(128), period=period), True, frames=3)
+    export(drive, target_of("folder", tmp_path), "drive")
+    times, read = drive.scan(1).times, target_of("folder", tmp_path).sequence("drive").scan(1).times
+    assert (read - times).abs().max() < 5e-3  # half a column: the middle is that of the columns that returned
+
+
 @pytest.mark.parametrize("name", ["kitti_00-08", "folder"])
 def test_an_empty_scan_keeps_its_place(name, tmp_path):
     write_folder(tmp_path / "scans", names=("a",), scans=3)

@@ -54,13 +54,27 @@ def test_point_times_and_intensities(tmp_path):
     assert scan.intensities is not None and (scan.intensities == 0.5).all()
 
 
+@pytest.mark.parametrize(("stamps", "share"), [(None, 1.0), ("0\n0.1\n0.2\n", 0.5), ("0\n0.2\n0.4\n", 0.25)])
+def test_scan_times_tell_what_share_of_a_period_the_points_take(tmp_path, stamps, share):
+    (tmp_path / "drive").mkdir()
+    for i in range(3):
+        write_pcd(tmp_path / "drive" / f"{i}.pcd", random_points(0), np.linspace(2e7, 7e7, 200).astype(np.uint32))
+    if stamps is not None:
+        (tmp_path / "drive" / "times.txt").write_text(stamps)
+    times = folder(tmp_path, deskew=True).sequence("drive").scan(1).times
+    assert times is not None and np.allclose(times, share * np.linspace(-0.5, 0.5, 200), atol=1e-6)
+
+
 def test_deskewing_needs_point_times(tmp_path):
     write_scans(tmp_path / "without")
+    (tmp_path / "zero").mkdir()
+    write_pcd(tmp_path / "zero" / "0.pcd", random_points(0), 0 * TIMES)
     (tmp_path / "with").mkdir()
     write_pcd(tmp_path / "with" / "0.pcd", random_points(0), TIMES)
     assert len(folder(tmp_path, deskew=True).sequence("with")) == 1
-    with pytest.raises(UserError, match=r"data\.deskew=false"):
-        folder(tmp_path, deskew=True).sequence("without")
+    for name in ("without", "zero"):
+        with pytest.raises(UserError, match=r"data\.deskew=false"):
+            folder(tmp_path, deskew=True).sequence(name)
     report = folder(tmp_path, deskew=True).check()
     assert not report.usable and "without" in details(report, "missing")
 

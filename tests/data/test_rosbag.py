@@ -39,7 +39,7 @@ def test_round_trip(tmp_path, kind, compression):
     for i in (3, 0, 2, 1, 2):
         scan = sequence.scan(i)
         assert np.array_equal(scan.points, random_points(i)) and scan.points.dtype == torch.float32
-        assert np.allclose(scan.times, np.linspace(-0.5, 0.5, 200), atol=1e-6)
+        assert np.allclose(scan.times, np.linspace(-0.495, 0.495, 200), atol=1e-6)  # 99 ms of 100
         assert (scan.intensities == 0.5).all()
     assert np.allclose(sequence.timestamps, 1.6e9 + 0.0495 + 0.1 * np.arange(4), rtol=0, atol=1e-6)
 
@@ -67,7 +67,7 @@ def test_layouts_of_points(tmp_path, kind, fields, row_padding):
     kept = np.isfinite(points).all(-1) & (points != 0).any(-1)
     assert kept.sum() == 197
     assert np.array_equal(scan.points, points[kept])
-    assert np.allclose(scan.times, (np.broadcast_to(np.arange(50), (4, 50))[kept] - 24.5) / 49)
+    assert np.allclose(scan.times, (np.broadcast_to(np.arange(50), (4, 50))[kept] - 24.5) / 100)  # ms
     assert scan.intensities is None
 
 
@@ -296,9 +296,11 @@ def test_deskewing_needs_point_times(tmp_path):
     write_bag(tmp_path, "without", {"/points": plain(1)})
     write_bag(tmp_path, "with", {"/points": [as_rows(random_points(0), OUSTER, t=TIMES_NS)]})
     data = rosbag(tmp_path, deskew=True)
+    write_bag(tmp_path, "zero", {"/points": [as_rows(random_points(0), OUSTER, t=0)] * 2})
     assert len(data.sequence("with")) == 1
-    with pytest.raises(UserError, match=r"data\.deskew=false"):
-        data.sequence("without")
+    for name in ("without", "zero"):
+        with pytest.raises(UserError, match=r"data\.deskew=false"):
+            data.sequence(name)
     assert "no point times" in details(data.check(), "missing")
 
 

@@ -57,6 +57,42 @@ def test_poses_are_those_of_the_middle_of_a_sweep(tmp_path, field, kind, unit, f
     assert np.abs(sequence.T_world_lidar.numpy() - np.linalg.inv(truth[0]) @ truth).max() < 0.01
 
 
+@pytest.mark.parametrize(("field", "kind", "unit"), [("t", "<u4", 1e9), ("time", "<f8", 1)])
+@pytest.mark.parametrize("period", [0.1, 0.05])
+def test_times_are_shares_of_the_period_whatever_part_of_it_they_cover(tmp_path, field, kind, unit, period):
+    """A sensor may be told to look to the front alone."""
+    seen = np.linspace(0.25, 0.75, 200) * period
+    rows = [as_rows(random_points(0), [*PLAIN, (field, kind)], **{field: seen * unit})] * 4
+    write_bag(tmp_path, "street", {"/points": rows}, stamps=1000 + period * np.arange(4))
+    sequence = rosbag(tmp_path, deskew=True).sequence("street")
+    assert np.allclose(sequence.scan(2).times, np.linspace(-0.25, 0.25, 200), atol=1e-5)
+    assert np.allclose(sequence.timestamps, 1000 + period * (np.arange(4) + 0.5), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("longest", [1.0, 9999.0])
+def test_times_of_an_unknown_unit_are_taken_for_a_whole_sweep(tmp_path, longest):
+    """Shares of the sweep already, or ticks of 10 us."""
+    rows = [as_rows(random_points(0), [*PLAIN, ("time", "<f4")], time=np.linspace(0, longest, 200))] * 3
+    write_bag(tmp_path, "street", {"/points": rows})
+    assert np.allclose(rosbag(tmp_path).sequence("street").scan(1).times, np.linspace(-0.5, 0.5, 200), atol=1e-5)
+
+
+@pytest.mark.parametrize("odd", [0.0, np.nan])
+def test_points_with_times_that_are_none_are_left_out(tmp_path, odd):
+    rows, stamps = [], 1.6e9 + 0.1 * np.arange(5)
+    for i, stamp in enumerate(stamps):
+        times = stamp + np.linspace(0, 0.099, 200)
+        if np.isnan(odd) or i != 2:  # the clock is read off the cloud in the middle
+            times[7] = odd
+        rows.append(as_rows(random_points(0), [*PLAIN, ("timestamp", "<f8")], timestamp=times))
+    write_bag(tmp_path, "street", {"/points": rows}, stamps=stamps)
+    sequence = rosbag(tmp_path).sequence("street")
+    assert np.allclose(sequence.timestamps, stamps + 0.0495, rtol=0, atol=1e-5)
+    scan = sequence.scan(3)
+    assert np.allclose(scan.times, np.delete(np.linspace(-0.495, 0.495, 200), 7), atol=1e-5)
+    assert np.array_equal(scan.points, np.delete(random_points(0), 7, axis=0))
+
+
 def test_recorded_times_are_after_the_sweep(tmp_path):
     rows = [as_rows(random_points(0), OUSTER, t=TIMES_NS)] * 3
     write_bag(tmp_path, "street", {"/points": rows}, stamps=np.zeros(3))

@@ -41,6 +41,11 @@ def timestamps_of(drive: Sequence) -> Float[Tensor, "n"]:
     return PERIOD_S * torch.arange(len(drive), dtype=torch.float64) if drive.timestamps is None else drive.timestamps
 
 
+def period_of(drive: Sequence) -> float:
+    """Seconds from scan to scan."""
+    return float(timestamps_of(drive).diff().median()) if len(drive) > 1 else PERIOD_S
+
+
 def ground_truth_of(drive: Sequence, format_name: str) -> Float[Tensor, "n 4 4"]:
     """The poses, for formats that cannot do without.
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
 from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.export.drives import PERIOD_S, scans_of, timestamps_of
+from lidarlearn.data.export.drives import period_of, scans_of, timestamps_of
 from lidarlearn.data.export.kitti import matrix_row
 from lidarlearn.data.folder import Folder
 from lidarlearn.data.ply import write_ply
@@ -38,13 +38,14 @@ def write_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd
     """
     folder = target.root / name
     folder.mkdir(parents=True, exist_ok=True)
+    period_s = period_of(drive)
     for index, scan in enumerate(scans_of(drive, name)):
         x, y, z = raise_beams(scan.points, -target.beam_correction_deg).numpy().T
         fields: dict[str, NDArray[np.float32]] = {"x": x, "y": y, "z": z}
         if scan.intensities is not None:
             fields["intensity"] = scan.intensities.numpy() * np.float32(target.max_intensity or 1.0)
         if scan.times is not None:
-            fields["t"] = ((scan.times - scan.times.min()) * PERIOD_S).numpy()
+            fields["t"] = ((scan.times - scan.times.min()) * period_s).numpy()
         _write(folder / f"{index:06d}{suffix}", fields, target.bin_columns)
     (folder / "times.txt").write_text(
         "".join(f"{time:.9f}\n" for time in timestamps_of(drive).tolist()), encoding="utf-8"
