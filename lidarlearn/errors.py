@@ -8,8 +8,8 @@ class UserError(Exception):
     """
 
 
-def require_positive(part: str, **settings: float | int) -> None:
-    """Raise a ValueError unless all settings of a part are above 0."""
-    wrong = ", ".join(f"{name}={value}" for name, value in settings.items() if not value > 0)
+def require_positive(part: str, **settings: float | int | None) -> None:
+    """Raise a ValueError unless all settings of a part are numbers above 0."""
+    wrong = ", ".join(f"{name}={value}" for name, value in settings.items() if value is None or not value > 0)
     if wrong:
         raise ValueError(f"{part}: {' and '.join(settings)} must be above 0, got {wrong}")

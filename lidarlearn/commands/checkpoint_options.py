@@ -54,14 +54,21 @@ def add_data(arguments: list[str], folder: Path) -> None:
     Args:
         arguments: the command line; it is completed.
         folder: an empty one for the options.
+
+    Raises:
+        UserError: that cannot be, and no experiment is asked for that might choose the data.
     """
     if is_data_given(arguments) or RECIPE in arguments:
         return
-    path = given_checkpoint(arguments, "one at a time; to evaluate several, add data=...")
-    if path is not None:
-        write_data(path, folder)
-        write_option(folder, "recipe", {"defaults": [{"override /data": OPTION}]}, header=GLOBAL)
-        add_to_search_path(arguments, folder, RECIPE)
+    try:
+        path = given_checkpoint(arguments, "one at a time; to evaluate several, add data=...")
+        if path is not None:
+            write_data(path, folder)
+            write_option(folder, "recipe", {"defaults": [{"override /data": OPTION}]}, header=GLOBAL)
+            add_to_search_path(arguments, folder, RECIPE)
+    except UserError:
+        if not any(argument.startswith("experiment=") for argument in arguments):
+            raise
 
 
 def is_data_given(arguments: Sequence[str]) -> bool:
@@ -89,7 +96,7 @@ def add_to_search_path(arguments: list[str], folder: Path, *options: str) -> Non
     """Let Hydra find the options in a folder, beside those where the command line has it search already.
 
     Args:
-        arguments: the command line; it is completed beside `ckpt=...`, because flags may stand behind all overrides.
+        arguments: the command line; it is completed behind the last of the overrides, where flags may follow.
         folder: of this machine alone.
         options: what else to add.
 
@@ -110,9 +117,11 @@ def add_to_search_path(arguments: list[str], folder: Path, *options: str) -> Non
             return  # composing the configuration will say what is wrong
         places += places_given
     arguments[:] = [argument for argument in arguments if argument not in given]
-    beside = max(i for i, argument in enumerate(arguments) if _CHECKPOINT.match(argument))
+    end = max(i for i, argument in enumerate(arguments) if _CHECKPOINT.match(argument))
+    while end < len(arguments) and not arguments[end].startswith("-"):
+        end += 1
     search_path = f"{_SEARCH_PATH}=[{','.join(quoted(str(place)) for place in dict.fromkeys(places))}]"
-    arguments[beside:beside] = [*options, search_path]
+    arguments[end:end] = [*options, search_path]
 
 
 def quoted(text: str) -> str:

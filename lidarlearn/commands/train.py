@@ -23,7 +23,7 @@ from lidarlearn.commands.run_folder import checkpoints_in, git_revision, write_r
 from lidarlearn.data.datamodule import OdometryDataModule
 from lidarlearn.errors import UserError
 from lidarlearn.training.module import PoseNetModule
-from lidarlearn.training.parts import build
+from lidarlearn.training.parts import TRUSTED_PACKAGES, build
 from lidarlearn.training.quiet import quiet
 from lidarlearn.training.resuming import require_resumable
 
@@ -69,21 +69,25 @@ def train(config: DictConfig, data_name: str) -> Path:
     return best if best.exists() else best.with_name("last.ckpt")
 
 
-def evaluate_command(checkpoint: Path, overrides: Sequence[str] = (), config_folder: str | None = None) -> str:
+def evaluate_command(
+    checkpoint: Path, overrides: Sequence[str] = (), config_folder: str | None = None, is_data_told: bool = True
+) -> str:
     """The command that evaluates a checkpoint, as it can be pasted into a shell.
 
     Args:
         checkpoint: the file.
         overrides: of its training; where the data lie is told anew, since a checkpoint does not say.
         config_folder: of the user's own options, from which its data may come.
+        is_data_told: whether the checkpoint tells the rest of its data. What is read by a class from elsewhere, which a
+            file must not choose, is told anew.
     """
     path = str(checkpoint.relative_to(Path.cwd()) if checkpoint.is_relative_to(Path.cwd()) else checkpoint)
     if not _PLAIN_CHARACTERS.issuperset(path):
         path = quoted(path)  # for Hydra; the shell's quotes come around it
     program = "python evaluate.py" if Path("evaluate.py").is_file() else "lidarlearn-evaluate"
-    arguments = [f"ckpt={path}", *(override for override in overrides if override.startswith("data.root="))]
-    if config_folder is not None:
-        arguments += ["--config-dir", config_folder]
+    arguments = [] if config_folder is None else ["--config-dir", config_folder]  # behind it more can be added
+    told_anew = ("data.root=",) if is_data_told else ("data=", "data.", "projection@data.")
+    arguments += [f"ckpt={path}", *(override for override in overrides if override.startswith(told_anew))]
     return f"{program} {shlex.join(arguments)}"
 
 
@@ -97,7 +101,8 @@ def _say_what_next(checkpoint: Path, config: DictConfig) -> None:
         print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
         hydra = HydraConfig.get()
         folder = next((place.path for place in hydra.runtime.config_sources if place.provider == "command-line"), None)
-        print(f"next:       {evaluate_command(checkpoint, hydra.overrides.task, folder)}")
+        is_data_told = config.data["_target_"].startswith(TRUSTED_PACKAGES)
+        print(f"next:       {evaluate_command(checkpoint, hydra.overrides.task, folder, is_data_told)}")
 
 
 def _require_workable(config: DictConfig) -> None:
@@ -116,7 +121,9 @@ def _require_workable(config: DictConfig) -> None:
             "a fused optimizer clips no gradients of 16 bits\n  change: optimizer.fused=false"
         )
     by_steps = config.schedulers[config.scheduler].get("total_steps", 0) is None
-    if by_steps and trainer.max_epochs in (None, -1) and trainer.max_steps in (None, -1):
+    # Lightning takes null for a thousand epochs, but for none where the time is limited.
+    is_endless = trainer.max_epochs == -1 or (trainer.max_epochs is None and trainer.max_time is not None)
+    if by_steps and is_endless and trainer.max_steps == -1:
         raise UserError(
             f"scheduler={config.scheduler} goes by the length of the training, which has no end: "
             f"trainer.max_epochs={trainer.max_epochs or 'null'}\n"

@@ -1,6 +1,7 @@
 """The registration half of an odometry: sampling, local map and Gauss-Newton under one name such as `kd_f2m`."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from lidarlearn.errors import require_positive
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.voxels import voxel_cells
+from lidarlearn.odometry.deskew import deskew
 from lidarlearn.odometry.local_map import LocalMap
 from lidarlearn.odometry.sampling import SampledScan, Sampling
 from lidarlearn.registration.association.aggregated_points import AggregatedPoints
@@ -44,11 +46,17 @@ class Backend:
     hypothesis_distance_m: float = 1.5
 
     def __post_init__(self) -> None:
-        distances = {name: getattr(self, name) for name in ("max_search_distance_m", "hypothesis_distance_m")}
-        require_positive("odometry", hypothesis_points=self.hypothesis_points, **distances)
+        require_positive(
+            "odometry", hypothesis_points=self.hypothesis_points, hypothesis_distance_m=self.hypothesis_distance_m
+        )
 
     def register(
-        self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor, surprise_m: float
+        self,
+        scan: SampledScan,
+        T_previous_new: Float[Tensor, "4 4"],
+        T_world_previous: Float[Tensor, "4 4"],
+        surprise_m: float,
+        per_scan: Callable[[Tensor], Tensor] = lambda T_previous_new: T_previous_new,
     ) -> RegistrationResult:
         """Register a scan from one guess of its motion.
 
@@ -60,24 +68,26 @@ class Backend:
             T_previous_new: the guess.
             T_world_previous: pose of the previous scan.
             surprise_m: how far points may be from where the guess has them [m].
+            per_scan: the motion over one scan period, of that since the previous scan: less where scans were lost.
         """
         final_m = self.registration.search_distance_m
         distance_m = min(final_m + 2 * surprise_m, self.max_search_distance_m)
-        result = self._register(scan, T_previous_new, T_world_previous, distance_m)
+        T_guess = T_world_previous @ T_previous_new
+        result = self._register(scan, per_scan(T_previous_new), T_guess, distance_m)
         if scan.times is None:
             return result
         found = se3.orthonormalize(se3.inverse(T_world_previous) @ result.T_world_lidar)
-        again = self._register(scan, found, T_world_previous, final_m)
+        again = self._register(scan, per_scan(found), T_world_previous @ found, final_m)
         return replace(again, iterations=result.iterations + again.iterations)
 
     def _register(
-        self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor, distance_m: float
+        self, scan: SampledScan, T_per_scan: Tensor, T_world_lidar: Tensor, distance_m: float
     ) -> RegistrationResult:
-        points = scan.deskewed(T_previous_new)
+        points = scan.deskewed(T_per_scan)
         return self.registration.register(
             points[scan.queries],
             self.local_map.association,
-            T_world_previous @ T_previous_new,
+            T_world_lidar,
             distance_m,
             self.normals(points, scan.queries),
             scan.phases[scan.queries],
@@ -98,53 +108,46 @@ class Backend:
         Returns:
             A motion from each guess, and its agreement, see `GaussNewton.agreement`.
         """
-        few = replace(scan, queries=scan.queries[:: max(math.ceil(len(scan.queries) / self.hypothesis_points), 1)])
+        chosen = scan.queries[:: max(math.ceil(len(scan.queries) / self.hypothesis_points), 1)]
+        points, normals = scan.points[chosen], self.normals(scan.points, chosen)
         if scan.times is None or not deskews:
-            motions = self._hypotheses(few.points, few.queries, T_previous_new, T_world_previous)
-            return motions, self._agreement(few.points, few.queries, T_world_previous @ motions)
-        motions = T_previous_new
-        for _ in range(_HYPOTHESIS_ROUNDS):
-            motions = torch.stack(
-                [self._hypotheses(few.deskewed(T), few.queries, T, T_world_previous) for T in motions.unbind()]
-            )
-        return motions, torch.tensor([self.agreement(few, T, T_world_previous) for T in motions.unbind()])
+            motions = self._hypotheses(points, normals, T_previous_new, T_world_previous)
+            return motions, self._agreement(points, normals, T_world_previous @ motions)
+        times, found, agreements = scan.times[chosen], [], []
+        for T in T_previous_new.unbind():
+            for _ in range(_HYPOTHESIS_ROUNDS):
+                T = self._hypotheses(deskew(points, times, T), normals, T, T_world_previous)
+            found.append(T)
+            agreements.append(self._agreement(deskew(points, times, T), normals, T_world_previous @ T))
+        return torch.stack(found), torch.stack(agreements)
 
     def _hypotheses(
         self,
         points: Float[Tensor, "n 3"],
-        chosen: Int[Tensor, "m"],
+        normals: Float[Tensor, "n 3"] | None,
         T_previous_new: Float[Tensor, "*batch 4 4"],
         T_world_previous: Tensor,
     ) -> Float[Tensor, "*batch 4 4"]:
-        """Motions that some of a scan's points come to from one or several guesses."""
+        """Motions that some points come to from one or several guesses."""
         quick = replace(
             self.registration,
             max_iterations=_HYPOTHESIS_ITERATIONS,
             translation_tolerance_m=_HYPOTHESIS_TOLERANCE * self.registration.translation_tolerance_m,
             rotation_tolerance_deg=_HYPOTHESIS_TOLERANCE * self.registration.rotation_tolerance_deg,
         )
-        result = quick.register(
-            points[chosen],
-            self.local_map.association,
-            T_world_previous @ T_previous_new,
-            self.hypothesis_distance_m,
-            self.normals(points, chosen),
-        )
+        T_initial, association = T_world_previous @ T_previous_new, self.local_map.association
+        result = quick.register(points, association, T_initial, self.hypothesis_distance_m, normals)
         return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar))
 
     def agreement(self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:
         """How well a motion agrees with the map, see `GaussNewton.agreement`."""
-        T_world_new = T_world_previous @ T_previous_new
-        return self._agreement(scan.deskewed(T_previous_new), scan.queries, T_world_new).item()
+        points = scan.deskewed(T_previous_new)
+        normals = self.normals(points, scan.queries)
+        return self._agreement(points[scan.queries], normals, T_world_previous @ T_previous_new).item()
 
-    def _agreement(self, points: Float[Tensor, "n 3"], chosen: Int[Tensor, "m"], T_world_lidar: Tensor) -> Tensor:
-        return self.registration.agreement(
-            points[chosen],
-            self.local_map.association,
-            T_world_lidar,
-            self.hypothesis_distance_m,
-            self.normals(points, chosen),
-        )
+    def _agreement(self, points: Float[Tensor, "n 3"], normals: Tensor | None, T_world_lidar: Tensor) -> Tensor:
+        association, distance_m = self.local_map.association, self.hypothesis_distance_m
+        return self.registration.agreement(points, association, T_world_lidar, distance_m, normals)
 
     def normals(self, points: Float[Tensor, "n 3"], chosen: Int[Tensor, "m"]) -> Float[Tensor, "m 3"] | None:
         """Normals of some of a scan's points, from the neighbourhoods among all, where the residual needs them."""

@@ -34,7 +34,8 @@ class Judgement:
         min_inlier_share: smallest acceptable share of those that fit it.
         min_fit_share: smallest expected `RegistrationResult.fit` as a share of the best of the last scans: below it,
             other motions are tried, as after a turn that is too wide to be pulled in and finds a false fit near by.
-        min_information: the weakest direction counts as degenerate below it, see `RegistrationResult.information`.
+        min_information: the weakest direction counts as degenerate below it, see `RegistrationResult.information`, and
+            below that of the registration, which holds what it knows less of.
             Normals of noisy points pose as information: up to 0.013 in a corridor, with projective association and
             3 cm of noise; a street has 0.04 and more, a motorway as little as 0.004.
         max_deviation_m: largest plausible change of motion from one scan to the next [m]; 0.5 m at 10 Hz is an

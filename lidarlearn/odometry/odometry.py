@@ -58,7 +58,7 @@ class Odometry(ScanByScan):
         self._T_world_lidar = se3.identity()
         self._motion = se3.identity()  # last one that was trusted
         self._doubted_motion: Tensor | None = None
-        self._first: SampledScan | None = None  # the map's only scan, as long as no other was registered to it
+        self._first: _Beginning | None = None  # the map's only scan, as long as no other was registered to it
         self._surprises_m: deque[float] = deque(maxlen=5)
         self._fits: deque[float] = deque(maxlen=5)
         self._frames = 0
@@ -68,7 +68,7 @@ class Odometry(ScanByScan):
     def register_scan(self, points: Points, times: Times | None = None) -> Frame:
         """Guess the motion, register, judge, try again if in doubt, add the scan to the map."""
         points, times = self._in_range(*as_scan(points, times, self._device))
-        guess = self._initialization.predict(points, self._motion)
+        guess = self._initialization.predict(points, self._motion.clone())
         scan = self._backend.sampling.sample(points, times)
         if self._backend.local_map.association.is_empty:
             health = self._begin(scan)
@@ -94,27 +94,27 @@ class Odometry(ScanByScan):
         status: Status = "ok" if self._frames == 0 else "restarted"
         if self._has_enough_points(scan):
             self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
-            self._first = scan
+            self._first = _Beginning(scan, self._T_world_lidar)
             self._coasting = 0
         else:
             status = "coasted"
         return replace(self._unregistered(scan, "start"), status=status)
 
-    def _set_off(self, scan: SampledScan, first: SampledScan, guess: InitialMotion) -> Health:
+    def _set_off(self, scan: SampledScan, first: "_Beginning", guess: InitialMotion) -> Health:
         """Register a scan to the only one there is, from motions of all kinds: none has been seen yet."""
         T_previous_new, source = guess.T_previous_new, guess.source
         if self._recovery:
             T_previous_new, source = self._search(scan, start_motions(T_previous_new)), "start"
-        if first.times is not None and not self._coasting:  # else the sensor has moved on since
+        if first.scan.times is not None:
             self._deskew_first(first, scan, T_previous_new, source)
         return self._advance(scan, T_previous_new, source)
 
-    def _deskew_first(self, first: SampledScan, scan: SampledScan, T_previous_new: Tensor, source: str) -> None:
+    def _deskew_first(self, first: "_Beginning", scan: SampledScan, T_previous_new: Tensor, source: str) -> None:
         """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the poses."""
         attempt = self._register(scan, T_previous_new, source)
         if self._judgement.accepts(attempt.result):
             self._backend.local_map.restart()
-            self._backend.local_map.update(first.deskewed(attempt.motion), self._T_world_lidar)
+            self._backend.local_map.update(first.scan.deskewed(self._per_scan(attempt.motion)), first.T_world_lidar)
 
     def _advance(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> Health:
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
@@ -154,7 +154,7 @@ class Odometry(ScanByScan):
     def _register(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> "_Attempt":
         is_searched = source in ("start", "recovery")
         surprise_m = _NOT_FAR_M if is_searched else max(self._surprises_m, default=math.inf)
-        result = self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m)
+        result = self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m, self._per_scan)
         motion = se3.orthonormalize(torch.linalg.solve(self._T_world_lidar, result.T_world_lidar))
         return _Attempt(T_previous_new, result, motion, self._assess(scan, result, motion, source))
 
@@ -182,13 +182,21 @@ class Odometry(ScanByScan):
 
     def _trust(self, motion: Tensor, health: Health) -> None:
         """Move, and take over the motion as the model of the next one if it is plausible or seen twice."""
+        per_scan = self._per_scan(motion)
         self._move(motion)
         doubted, self._doubted_motion = self._doubted_motion, None
         confirmed = doubted is not None and self._judgement.is_plausible(motion_difference(doubted, motion))
         if self._first is not None or not health.implausible or confirmed:
-            self._motion = motion
+            self._motion = per_scan
         else:
             self._doubted_motion = motion
+
+    def _per_scan(self, motion: Tensor) -> Tensor:
+        """The motion over one scan period: where scans after a map's first were lost, a share of that since then."""
+        if self._first is None or not self._coasting:
+            return motion
+        T_first_new = torch.linalg.solve(self._first.T_world_lidar, self._T_world_lidar @ motion)
+        return se3.exp(se3.log(T_first_new) / (1 + self._coasting))
 
     def _move(self, motion: Tensor) -> None:
         self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ motion)
@@ -221,6 +229,14 @@ class Odometry(ScanByScan):
 
     def _has_enough_points(self, scan: SampledScan) -> bool:
         return len(scan.queries) >= self._judgement.min_points
+
+
+@dataclass(frozen=True)
+class _Beginning:
+    """The first scan of a map, and where it was begun."""
+
+    scan: SampledScan
+    T_world_lidar: Float[Tensor, "4 4"]
 
 
 @dataclass(frozen=True)

@@ -135,8 +135,7 @@ class GridSampling(Sampling):
     _recordings: Recordings = field(default_factory=Recordings, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        voxels = {"map_voxel_m": self.map_voxel_m, "query_voxel_m": self.query_voxel_m}
-        require_positive("sampling", **{name: size_m for name, size_m in voxels.items() if size_m is not None})
+        require_positive("sampling", map_voxel_m=self.map_voxel_m)
 
     @property
     def neighbourhood_m(self) -> float:

@@ -102,7 +102,7 @@ class InitializationAlone(ScanByScan):
     def register_scan(self, points: Points, times: Times | None = None) -> Frame:
         """The previous pose and the guessed motion."""
         points, _ = as_scan(points, times, self._device)
-        guess = self._initialization.predict(points[points.isfinite().all(dim=1)], self._motion)
+        guess = self._initialization.predict(points[points.isfinite().all(dim=1)], self._motion.clone())
         if self._frames:
             self._motion = guess.T_previous_new
             self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ self._motion)

@@ -15,10 +15,11 @@ from lidarlearn.errors import require_positive
 
 
 class RobustWeight(ABC):
-    """How much a correspondence counts; what a subclass takes are scales, above 0."""
+    """How much a correspondence counts; scales in metres, whose names end in `_m`, must be above 0."""
 
     def __post_init__(self) -> None:
-        require_positive(f"weight {type(self).__name__}", **vars(self))
+        scales = {name: value for name, value in vars(self).items() if name.endswith("_m")}
+        require_positive(f"weight {type(self).__name__}", **scales)
 
     @abstractmethod
     def weight(

@@ -10,8 +10,10 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_warn
 
 from lidarlearn.training.checkpoints import load_checkpoint
+from lidarlearn.training.module import PoseNetModule
 
-_ERROR = "best_error"  # in a checkpoint, beside what Lightning keeps
+_ERROR, _KIND = "best_error", "best_error_is"  # in a checkpoint, beside what Lightning keeps
+_OF_POSES, _MISFIT = "of poses", "misfit"
 _NO_MATTER_OF_VALIDATION = ("root", "train_sequences", "test_sequences", "deskew", "workers")  # among the data's
 
 
@@ -32,7 +34,7 @@ class BestCheckpoint(ModelCheckpoint):
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """Tell the smallest error so far."""
-        checkpoint[_ERROR] = self.best_model_score
+        checkpoint[_ERROR], checkpoint[_KIND] = self.best_model_score, _kind(pl_module)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Leave out what Lightning would take over: the file may have been moved, or be of a later epoch."""
@@ -73,8 +75,17 @@ def _why_not_comparable(best: Mapping[str, Any], trainer: Trainer, pl_module: Li
     if best["epoch"] >= trainer.current_epoch:
         return f"is of epoch {best['epoch'] + 1}, after the one that goes on"
     was, now = (_validation(parts["trained_on"]) for parts in (best["hyper_parameters"], pl_module.hparams))
+    # earlier versions told no kind: where there was no ground truth it was the loss
+    was, now = {**was, "error": best.get(_KIND, _OF_POSES)}, {**now, "error": _kind(pl_module)}
     changed = [key for key in {**was, **now} if was.get(key) != now.get(key)]
     return f"was validated in another way ({', '.join(changed)})" if changed else None
+
+
+def _kind(module: LightningModule) -> str:
+    """What the validation error is, see `PoseNetModule.on_validation_epoch_end`."""
+    assert isinstance(module, PoseNetModule)
+    has_truth = any(sequence.T_world_lidar is not None for sequence in module.val_sequences)
+    return _OF_POSES if has_truth else _MISFIT
 
 
 def _validation(trained_on: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,7 +22,8 @@ class UntrustedTargetError(UserError):
     def __init__(self, what: str, why: str) -> None:
         super().__init__(
             f"{what} is refused: {why}; a checkpoint could run any code otherwise\n"
-            "  change: use a checkpoint written by lidarlearn's training; a class of your own belongs into lidarlearn/"
+            "  change: use a checkpoint written by lidarlearn's training; a class of your own belongs into lidarlearn/,"
+            " but one that reads data may also be chosen by data=NAME"
         )
 
 

@@ -32,8 +32,11 @@ def require_resumable(path: Path, module: PoseNetModule, trainer: Trainer) -> No
                 f"ckpt={path} does not go on with another {part}: {differences}\n"
                 f"  change: leave the settings of the {part} to the checkpoint, or train anew, without ckpt"
             )
+    loop = checkpoint["loops"]["fit_loop"]
+    epochs, batches = loop["epoch_progress"]["current"], loop["epoch_loop.batch_progress"]
+    is_closed = epochs["processed"] == epochs["started"]  # the epoch; else training goes on within it
     for what, done, most in (
-        ("epochs", checkpoint["epoch"] + 1, trainer.max_epochs),
+        ("epochs", checkpoint["epoch"] + is_closed, trainer.max_epochs),
         ("steps", checkpoint["global_step"], trainer.max_steps),
     ):
         if most is not None and 0 <= most <= done:
@@ -47,9 +50,8 @@ def require_resumable(path: Path, module: PoseNetModule, trainer: Trainer) -> No
             f"ckpt={path} has already been trained for {clock:.0f} s, which is all of trainer.max_time\n"
             "  change: trainer.max_time, which counts from the first start"
         )
-    batches = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
-    if not batches["is_last_batch"]:
+    if is_closed and not batches["is_last_batch"]:
         rank_zero_warn(
-            f"ckpt={path} was stopped within epoch {checkpoint['epoch'] + 1}, after {batches['current']['completed']} "
+            f"ckpt={path} was stopped within epoch {checkpoint['epoch'] + 1}, after {batches['current']['processed']} "
             "batches: training goes on with the next epoch, and the others of this one are left out"
         )

@@ -98,6 +98,15 @@ def test_flags_may_stand_behind_the_overrides(checkpoint, tmp_path, program, add
     assert arguments[-3:] == ["-m", "--config-dir", "mine"] and "recipe=checkpoint" in arguments[1:-3]
 
 
+@pytest.mark.parametrize("order", [["recipe=paper", "CKPT"], ["CKPT", "recipe=paper"]])
+def test_the_recipe_of_the_checkpoint_comes_after_another(checkpoint, tmp_path, order):
+    arguments = ["train.py", *(f"ckpt={checkpoint}" if word == "CKPT" else word for word in order), "run_dir=x"]
+    add_settings(arguments, tmp_path / "o")
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        config = compose("train", arguments[1:])
+    assert config.datamodule.batch_size == 2 and config.data.max_frames == FRAMES
+
+
 def test_a_schedule_without_milestones_goes_on_too(checkpoint, tmp_path):
     content = torch.load(checkpoint, weights_only=True)
     parts = content["hyper_parameters"]
@@ -139,6 +148,13 @@ def test_options_of_the_user_are_found_too(checkpoint, tmp_path, program):
 def test_several_checkpoints_at_once_are_refused(tmp_path, program, remedy):
     with pytest.raises(UserError, match=remedy):
         composed(tmp_path / "o", Path("a.ckpt,b.ckpt"), program=program)
+
+
+@pytest.mark.parametrize("arguments", [["ckpt=a.ckpt,b.ckpt"], ["ckpt=a.ckpt", "hydra/launcher=submitit_slurm"]])
+def test_an_experiment_may_choose_the_data_where_checkpoints_cannot(tmp_path, arguments):
+    command = ["evaluate.py", *arguments, "experiment=paper/kitti_sim", "-m"]
+    add_data(command, tmp_path / "o")
+    assert command == ["evaluate.py", *arguments, "experiment=paper/kitti_sim", "-m"]
 
 
 @pytest.mark.parametrize("program", ["train", "evaluate"])
@@ -183,6 +199,21 @@ def test_a_training_that_was_stopped_within_an_epoch_says_what_is_left_out(scans
     assert "trainer.max_steps=1 is reached within an epoch" in out and "100 %" not in out
     with pytest.warns(UserWarning, match="stopped within epoch 1, after 1 batches"):
         run(tmp_path / "again", scans, f"ckpt={last}", "trainer.max_steps=-1")
+
+
+@pytest.mark.slow
+def test_a_checkpoint_from_within_an_epoch_goes_on_there(scans, tmp_path, recwarn):
+    of_steps = [
+        "+callbacks.steps._target_=lightning.pytorch.callbacks.ModelCheckpoint", "+callbacks.steps.filename=step",
+        f"+callbacks.steps.dirpath={tmp_path}", "+callbacks.steps.every_n_train_steps=1", "trainer.max_steps=3",
+    ]  # fmt: skip
+    run(tmp_path / "run", scans, *RUN, *of_steps)
+    within = tmp_path / "within" / "step.ckpt"
+    within.parent.mkdir()
+    (tmp_path / "step.ckpt").rename(within)
+    run(tmp_path / "again", scans, f"ckpt={within}", "trainer.max_steps=-1")
+    assert not [str(w.message) for w in recwarn if "stopped within" in str(w.message)]
+    assert [step for step, _ in curves(tmp_path / "again")["train/loss_step"]] == [3]
 
 
 @pytest.mark.slow

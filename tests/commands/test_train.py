@@ -55,8 +55,10 @@ def test_the_revision_is_a_commit_or_unknown():
 
 def test_the_command_that_is_printed_knows_where_the_data_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    overrides = ["data=folder", "data.root=/my scans", "trainer.max_epochs=1"]
+    overrides = ["data=folder", "data.root=/my scans", "trainer.max_epochs=1", "data.max_frames=9"]
     assert evaluate_command(tmp_path / "a.ckpt", overrides) == "lidarlearn-evaluate ckpt=a.ckpt 'data.root=/my scans'"
+    told = evaluate_command(tmp_path / "a.ckpt", overrides, is_data_told=False)
+    assert told == "lidarlearn-evaluate ckpt=a.ckpt data=folder 'data.root=/my scans' data.max_frames=9"
 
 
 def test_the_revision_is_not_that_of_a_project_with_lidarlearn_in_its_environment(tmp_path, monkeypatch):
@@ -106,7 +108,7 @@ def test_the_command_that_is_printed_finds_the_options_of_the_user(tmp_path, mon
         sys, "argv", ["train.py", f"hydra.run.dir={tmp_path}/run", "--config-dir", f"{tmp_path}/my configs"]
     )
     train.main()
-    assert f"--config-dir '{tmp_path}/my configs'" in capsys.readouterr().out
+    assert f"--config-dir '{tmp_path}/my configs' ckpt=" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("rank", [0, 1])

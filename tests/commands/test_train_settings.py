@@ -14,7 +14,7 @@ from tests.training.runs import configured
         (["trainer.precision=bf16-true"], r"trainer\.precision to one of .*bf16-mixed"),
         (["trainer.logger=false"], "~callbacks.learning_rate"),
         (["trainer.max_epochs=-1", "scheduler=cosine"], r"trainer\.max_epochs"),
-        (["trainer.max_epochs=null", "scheduler=cosine"], r"trainer\.max_epochs"),
+        (["trainer.max_epochs=null", "trainer.max_time=00:01:00:00", "scheduler=cosine"], r"trainer\.max_epochs"),
         (["trainer.val_check_interval=2"], r"trainer\.check_val_every_n_epoch"),
         (["scheduler=cosin"], "choose one of step, cosine, constant"),
     ],

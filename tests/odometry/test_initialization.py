@@ -6,7 +6,7 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.odometry.initialization import ConstantVelocity, ElevationImage, NoInitialization
+from lidarlearn.odometry.initialization import ConstantVelocity, ElevationImage, InitialMotion, NoInitialization
 from lidarlearn.odometry.initialization.posenet import PoseNetInitialization
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import hdl64
@@ -90,3 +90,9 @@ def test_posenet_is_shown_the_previous_scan_and_the_new_one(urban):
     for i in (1, 2):
         guess = initialization.predict(urban.scan(i).points, LAST)
         assert guess.T_previous_new[:2, 3].tolist() == [counts[i - 1], counts[i]]
+
+
+@pytest.mark.parametrize("T_previous_new", [torch.eye(4), torch.full((4, 4), torch.nan, dtype=torch.float64)])
+def test_a_guess_that_is_no_pose_names_its_initialization(T_previous_new):
+    with pytest.raises(ValueError, match=r"initialization 'mine': T_previous_new must be a finite \(4, 4\)"):
+        InitialMotion(T_previous_new, "mine")

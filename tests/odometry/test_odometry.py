@@ -12,8 +12,9 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.odometry import Backend, GridSampling, LocalMap, Odometry
-from lidarlearn.odometry.initialization import ConstantVelocity
+from lidarlearn.odometry.initialization import ConstantVelocity, Initialization
 from lidarlearn.odometry.sampling import map_voxel_m
+from lidarlearn.odometry.scan_by_scan import InitializationAlone
 from lidarlearn.registration.association import KdTree
 from lidarlearn.registration.gauss_newton import GaussNewton
 from lidarlearn.registration.residuals import GeneralizedIcp
@@ -83,6 +84,22 @@ def test_a_pose_belongs_to_whom_it_was_given(name):
         pose = odometry.register_scan(points).T_world_lidar
         assert torch.equal(pose, expected.T_world_lidar)
         pose[:3, 3] += 100
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_an_initialization_may_do_with_the_last_motion_what_it_likes(alone):
+    class Spoiling(Initialization):
+        def predict(self, points, last_motion):
+            guess = ConstantVelocity().predict(points, last_motion.clone())
+            last_motion.zero_()
+            return guess
+
+    def odometry(initialization):
+        if alone:
+            return InitializationAlone(initialization)
+        return Odometry(initialization, Backend(GridSampling(), LocalMap(KdTree())))
+
+    assert torch.equal(*(poses(run(odometry(i), scans()[:4])) for i in (Spoiling(), ConstantVelocity())))
 
 
 @pytest.mark.parametrize(

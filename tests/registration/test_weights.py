@@ -1,9 +1,10 @@
 import math
+from dataclasses import dataclass
 
 import pytest
 import torch
 
-from lidarlearn.registration.weights import Cauchy, CutOff, GemanMcClure, Huber, NoWeight, Proximity
+from lidarlearn.registration.weights import Cauchy, CutOff, GemanMcClure, Huber, NoWeight, Proximity, RobustWeight
 
 KERNELS = [NoWeight(), Proximity(), Huber(), CutOff(), GemanMcClure(), Cauchy()]
 RESIDUALS = torch.linspace(-3, 3, 601, dtype=torch.float64)
@@ -59,3 +60,17 @@ def test_weights_are_those_of_the_robust_cost_they_are_named_after(kernel, rho):
 @pytest.mark.parametrize("shape", [(), (0,), (3, 1, 2)])
 def test_any_batch_shape(kernel, shape):
     assert kernel.weight(torch.zeros(shape), torch.zeros(shape)).shape == shape
+
+
+def test_a_weight_of_ones_own_may_have_a_shape_beside_its_scale():
+    @dataclass(frozen=True)
+    class Barron(RobustWeight):
+        alpha: float = -2.0
+        scale_m: float = 0.1
+
+        def weight(self, residuals, squared_distances):
+            return ((residuals / self.scale_m) ** 2 / abs(self.alpha - 2) + 1) ** (self.alpha / 2 - 1)
+
+    assert Barron().weight(torch.zeros(1), torch.zeros(1)) == 1
+    with pytest.raises(ValueError, match=r"weight Barron: scale_m must be above 0, got scale_m=0\.0"):
+        Barron(scale_m=0.0)

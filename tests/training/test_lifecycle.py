@@ -180,6 +180,24 @@ def test_a_best_checkpoint_that_does_not_compare_is_kept(run, tmp_path):
     assert (tmp_path / "checkpoints" / "best_before_epoch_004.ckpt").read_bytes() == best.read_bytes()
 
 
+@pytest.mark.slow
+def test_a_loss_does_not_compare_with_a_misfit(tmp_path):
+    """Without ground truth earlier versions chose by the loss, and did not say so."""
+    drives = {"frames": 9, "without_truth": ["0", "2"]}
+    train(configured(tmp_path, "trainer.max_epochs=1", **drives), data_name="boxes")
+    checkpoints = tmp_path / "checkpoints"
+    content = torch.load(checkpoints / "best.ckpt", weights_only=True)
+    content["best_error"] = 0 * content["best_error"]
+    torch.save(content, checkpoints / "best.ckpt")
+    goes_on = configured(tmp_path, "trainer.max_epochs=2", f"ckpt={checkpoints}/last.ckpt", **drives)
+    assert load_checkpoint(train(goes_on, data_name="boxes"))["epoch"] == 0
+    del content["best_error_is"]
+    torch.save(content, checkpoints / "best.ckpt")
+    goes_on = configured(tmp_path, "trainer.max_epochs=3", f"ckpt={checkpoints}/last.ckpt", **drives)
+    with pytest.warns(UserWarning, match=r"another way \(error\)"):
+        assert load_checkpoint(train(goes_on, data_name="boxes"))["epoch"] == 2
+
+
 def test_maps_kept_on_the_device_train_the_same(tmp_path, capsys):
     losses = []
     for resident in ("true", "false"):

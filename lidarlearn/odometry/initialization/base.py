@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -18,6 +19,15 @@ class InitialMotion:
 
     T_previous_new: Float[Tensor, "4 4"]
     source: str
+
+    def __post_init__(self) -> None:
+        T = self.T_previous_new
+        is_pose = isinstance(T, Tensor) and T.shape == (4, 4) and T.dtype == torch.float64 and T.device.type == "cpu"
+        if not is_pose or not T.isfinite().all():
+            raise ValueError(
+                f"initialization {self.source!r}: T_previous_new must be a finite (4, 4) tensor of float64 on the CPU, "
+                f"but is {T}"
+            )
 
 
 class Initialization(ABC):
