@@ -63,12 +63,12 @@ def test_points_of_one_instant_move_together():
     torch.testing.assert_close(deskew(points, torch.full((50,), 0.5), MOTION), se3.transform(half, points))
 
 
-@pytest.mark.parametrize(("world", "frames"), [("highway", 25), ("segway", 40)])
+@pytest.mark.parametrize("world", ["highway", "segway"])
 @kd_at_least
-def test_deskewing_lowers_the_error_at_high_speed_and_when_the_sensor_swings(world, frames, association):
+def test_deskewing_lowers_the_error_at_high_speed_and_when_the_sensor_swings(world, association):
     """On the Segway constant velocity alone gains nothing: no scan moves as the one before it."""
-    drive = Drive(world, seed=7, frames=frames, motion_distortion=True)
-    scans = [drive.scan(i) for i in range(frames)]
+    drive = Drive(world, seed=7, frames=40, motion_distortion=True)
+    scans = list(drive)
     projection = "hdl64" if world == "highway" else "hdl32_inverted"
     with_times, without = (build(f"cv+{association}_f2m", projection=projection) for _ in range(2))
     deskewed = [with_times.register_scan(scan.points, scan.times) for scan in scans]
