@@ -2,56 +2,119 @@
 
 import ast
 import hashlib
-from collections.abc import Iterator
+import inspect
+import sys
+import sysconfig
+import uuid
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 PACKAGE = Path(__file__).resolve().parent
 
+_STANDARD_LIBRARY = Path(sysconfig.get_path("stdlib")).resolve()
+
+Origin = Path | type | Callable[..., Any]
+
 
 @cache
-def source_digest(*files: Path, within: Path = PACKAGE) -> str:
+def source_digest(*origins: Origin, within: Path = PACKAGE) -> str:
     """Hash of source files and of all modules that they import, directly or not.
 
     The same code gives the same results, committed or not; other code may not. What counts is the syntax: comments,
-    docstrings and line breaks do not. Libraries are not looked at.
+    docstrings and line breaks do not. What libraries import is not looked at, nor what is imported by a name that is
+    put together while running.
 
     Args:
-        files: where to begin.
-        within: imports are followed only to files below this folder of the package.
+        origins: where to begin: files, or classes and functions, of the package or anybody's. These stand for their
+            files and those of their bases; in a notebook, for the cell that defines them. The digest of one whose
+            source is nowhere to be seen is another in every process.
+        within: of the package's files, imports are followed only to those below this folder.
     """
     digest = hashlib.sha256()
-    for path, tree in sorted(_with_imports(files, within).items(), key=lambda file: file[0]):
+    for path, tree in sorted(_with_imports(origins, within).items(), key=lambda file: file[0]):
         name = path.relative_to(PACKAGE).as_posix() if path.is_relative_to(PACKAGE) else path.name
         digest.update(name.encode() + b"\0" + ast.dump(_without_docstrings(tree)).encode() + b"\0")
     return digest.hexdigest()[:12]
 
 
-def _with_imports(files: tuple[Path, ...], within: Path) -> dict[Path, ast.Module]:
+def _with_imports(origins: Iterable[Origin], within: Path) -> dict[Path, ast.Module]:
     found: dict[Path, ast.Module] = {}
-    ahead = [path.resolve() for path in files]
+    ahead = [source for origin in origins for source in _sources(origin)]
     while ahead:
-        path = ahead.pop()
+        path, cell = ahead.pop()
         if path not in found:
-            found[path] = ast.parse(path.read_bytes())
-            ahead += [file for file in _imports(path, found[path]) if file.is_relative_to(within)]
+            found[path] = _parsed(path.read_bytes() if cell is None else cell)
+            ahead += [(file, None) for file in _imports(path, found[path]) if _followed(file, within)]
     return found
 
 
+def _sources(origin: Origin) -> Iterator[tuple[Path, bytes | None]]:
+    """The files behind an origin; where there is none, what it consists of under a name in its stead."""
+    if isinstance(origin, Path):
+        yield origin.resolve(), None
+        return
+    owner = origin.__self__ if inspect.ismethod(origin) else origin
+    for part in inspect.getmro(owner) if inspect.isclass(owner) else (owner,):
+        if not inspect.isclass(part) and not inspect.isroutine(part):  # an object, made of who knows what
+            yield Path(type(part).__name__).resolve(), _never_seen_before()
+        elif (part.__module__ or "").partition(".")[0] not in sys.stdlib_module_names:
+            file = getattr(sys.modules.get(part.__module__), "__file__", None)
+            yield (Path(file).resolve(), None) if file else (Path(part.__qualname__).resolve(), _cell(part))
+
+
+def _cell(part: type | Callable[..., Any]) -> bytes:
+    """The cell of a notebook that defines a class, which only its methods can tell, or a function."""
+    for function in filter(inspect.isfunction, [part, *getattr(part, "__dict__", {}).values()]):
+        try:
+            return "".join(inspect.findsource(function)[0]).encode()
+        except OSError:  # of a dataclass's methods, for example
+            continue
+    return _never_seen_before()
+
+
+def _never_seen_before() -> bytes:
+    return str(uuid.uuid4().int).encode()
+
+
+def _parsed(source: bytes) -> ast.Module:
+    try:
+        return ast.parse(source)
+    except (SyntaxError, ValueError):  # an extension module, or a notebook's own syntax: every byte counts
+        return ast.Module([ast.Expr(ast.Constant(source))], [])
+
+
+def _followed(file: Path, within: Path) -> bool:
+    if file.is_relative_to(PACKAGE):
+        return file.is_relative_to(within)
+    return not file.is_relative_to(_STANDARD_LIBRARY) and {"site-packages", "dist-packages"}.isdisjoint(file.parts)
+
+
 def _imports(path: Path, tree: ast.Module) -> Iterator[Path]:
-    """The files of the package's modules that a file imports, wherever in it."""
+    """The files of the modules that a file imports, wherever in it."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            origin, names = PACKAGE.parent, [alias.name for alias in node.names]
+            folders, names = _import_folders(path), [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):  # of a name nobody can tell whether it is a module but the disk
-            origin = path.parents[node.level - 1] if node.level else PACKAGE.parent
+            folders = [path.parents[node.level - 1]] if node.level else _import_folders(path)
             start = [node.module] if node.module else []
             names = [".".join(start), *(".".join([*start, alias.name]) for alias in node.names)]
         else:
             continue
         for name in names:
-            module = origin.joinpath(*name.split("."))
-            yield from (file for file in (module.with_suffix(".py"), module / "__init__.py") if file.is_file())
+            modules = [folder.joinpath(*name.split(".")) for folder in folders]
+            files = (file for module in modules for file in (module / "__init__.py", module.with_suffix(".py")))
+            yield from (file.resolve() for file in islice(filter(Path.is_file, files), 1))
+
+
+def _import_folders(path: Path) -> list[Path]:
+    """Where absolute imports of a file are looked for, in this order."""
+    if path.is_relative_to(PACKAGE):
+        return [PACKAGE.parent]
+    beside = next(folder for folder in path.parents if not (folder / "__init__.py").is_file())
+    return [beside, *(Path(entry).resolve() for entry in sys.path), PACKAGE.parent]
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:

@@ -1,5 +1,10 @@
 """Digests of code: they follow what is imported, and nothing else."""
 
+import functools
+import importlib
+import linecache
+import sys
+
 import pytest
 
 from lidarlearn import source_digest as module
@@ -88,3 +93,121 @@ def test_words_do_not_count(package, code, same):
 def test_what_is_kept_depends_on_the_code_that_makes_it(start, within, needed, idle):
     found = {path.name for path in module._with_imports((module.PACKAGE / start,), (module.PACKAGE / within).resolve())}
     assert needed <= found and not idle & found
+
+
+OUTSIDE = {
+    "beside/mine/__init__.py": "",
+    "beside/mine/reader.py": """
+import my_helper
+from my_base import Base
+class Reader(Base):
+    @classmethod
+    def make(cls):
+        import a_library
+        from . import lazy
+def build(): ...
+partial = __import__("functools").partial(build)
+""",
+    "beside/mine/lazy.py": "",
+    "beside/my_helper.py": "def f():\n    from package.far import g\n",
+    "beside/other.py": "",
+    "on_path/my_base.py": "import my_registry\nclass Base: ...\n",
+    "on_path/my_registry.py": "",
+    "site-packages/a_library.py": "import inside\n",
+}
+
+
+@pytest.fixture
+def outside(package, monkeypatch):
+    """Somebody's modules, that import one another, a library and the package."""
+    root = package.parent
+    for name, content in OUTSIDE.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(content)
+    for folder in ("beside", "on_path", "site-packages"):
+        monkeypatch.syspath_prepend(root / folder)
+    yield root
+    for name in ("mine", "mine.reader", "my_helper", "my_base", "my_registry"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize("origin", ["Reader", "Reader.make", "build"])
+@pytest.mark.parametrize(
+    ("changed", "matters"),
+    [
+        ("beside/mine/reader.py", True),
+        ("beside/mine/lazy.py", True),
+        ("beside/my_helper.py", True),
+        ("on_path/my_base.py", True),
+        ("on_path/my_registry.py", True),
+        ("package/far.py", True),
+        ("beside/other.py", False),
+        ("site-packages/a_library.py", False),
+        ("package/other.py", False),
+    ],
+)
+def test_a_class_of_somebody_else_is_followed_through_what_lies_beside_it(outside, origin, changed, matters):
+    digests = []
+    for content in ("", "changed = 1\n"):
+        with (outside / changed).open("a") as file:
+            file.write(content)
+        source_digest.cache_clear()
+        start = functools.reduce(getattr, origin.split("."), _reader())
+        digests.append(source_digest(start, within=outside / "package"))
+    assert (digests[0] != digests[1]) == matters
+
+
+def _reader():
+    return importlib.import_module("mine.reader")
+
+
+def test_the_bases_of_a_class_count_wherever_they_are_imported(outside):
+    built = type("Built", (_reader().Reader,), {"__module__": __name__})
+    found = {path.name for path in module._with_imports((built,), outside / "package")}
+    assert {"reader.py", "my_base.py", "my_registry.py", "test_source_digest.py"} <= found
+
+
+CELL = "SCALE = 2\nclass Drive:\n    def scan(self):\n        import my_helper\n        return SCALE\n"
+
+
+def _notebook(source, kept=True):
+    """A class as a notebook has it: without a file, its source known to `linecache` alone."""
+    name = "/tmp/ipykernel_1/1.py"
+    linecache.cache.pop(name, None)
+    if kept:
+        linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
+    namespace = {"__name__": "a_notebook"}
+    exec(compile(source, name, "exec"), namespace)
+    return namespace["Drive"]
+
+
+@pytest.mark.parametrize(
+    ("code", "same"),
+    [(CELL + "# so\n", True), (CELL.replace("2", "3"), False), (CELL.replace("return", "return -"), False)],
+)
+def test_a_notebook_s_class_counts_by_its_cell(outside, code, same):
+    assert (source_digest(_notebook(CELL)) == source_digest(_notebook(code))) == same
+
+
+def test_what_a_notebook_s_cell_imports_counts(outside):
+    before = source_digest(_notebook(CELL))
+    (outside / "beside" / "my_helper.py").write_text("changed = 1\n")
+    assert source_digest(_notebook(CELL)) != before
+
+
+def test_code_that_nobody_can_see_is_never_the_same(outside):
+    hidden, partial, empty = _notebook(CELL, kept=False), _reader().partial, _notebook("class Drive: ...\n")
+    for origin in (hidden, partial, empty):
+        before = source_digest(origin)
+        assert source_digest(origin) == before  # within a process, it is
+        source_digest.cache_clear()  # as another one begins
+        assert source_digest(origin) != before
+
+
+def test_what_cannot_be_parsed_counts_by_its_bytes(package):
+    path, digests = package / "other.py", []
+    for content in (b"%magic a", b"%magic b", b"\x7fELF\0a", b"\x7fELF\0b"):
+        path.write_bytes(content)
+        source_digest.cache_clear()
+        digests.append(source_digest(path))
+    assert len(set(digests)) == 4

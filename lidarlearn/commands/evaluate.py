@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from lidarlearn.commands import entry_point
@@ -114,10 +114,11 @@ def _own(
     run_folder: Path,
 ) -> Iterator[tuple[Score, Tensor]]:
     """Run every method on every sequence, unless the run folder holds that run, and score what they export."""
-    code = code_digest()
+    data = OmegaConf.to_container(config.data, resolve=True)
     with RunProgress() as progress:
         for method in methods:
-            own = {**method_settings(config, method, networks), "code": code}
+            own = method_settings(config, method, networks)
+            own["code"] = code_digest(own, data)
             for sequence in sequences.values():
                 export = Export(run_folder / "trajectories" / str(method), sequence.name)
                 settings = {"scans": sequence.fingerprint, **own}

@@ -1,8 +1,11 @@
 """What every run leaves in its folder besides its results: the effective config and the revision of the code."""
 
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
 from lidarlearn.errors import UserError
@@ -21,9 +24,20 @@ def git_revision() -> str:
         return "unknown"
 
 
-def code_digest() -> str:
-    """Hash of the package's source: the same code gives the same results, committed or not."""
-    return source_digest(*PACKAGE.rglob("*.py"))
+def code_digest(*settings: Any) -> str:
+    """Hash of the source behind a result: the same code gives the same results, committed or not.
+
+    Args:
+        settings: plain values, of which each `_target_` that is not the package's counts beside the package.
+
+    Raises:
+        UserError: a `_target_` is not there.
+    """
+    others = sorted(target for target in set(_targets(settings)) if target.partition(".")[0] != PACKAGE.name)
+    try:
+        return source_digest(*PACKAGE.rglob("*.py"), *map(get_object, others))
+    except ImportError as error:
+        raise UserError(str(error)) from error
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
@@ -45,6 +59,17 @@ def write_run_description(folder: Path, config: DictConfig) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
     (folder / "git_revision.txt").write_text(git_revision() + "\n", encoding="utf-8")
+
+
+def _targets(settings: Any) -> Iterator[str]:
+    """All `_target_`s in plain values."""
+    if isinstance(settings, dict):
+        if "_target_" in settings:
+            yield str(settings["_target_"])
+        settings = list(settings.values())
+    if isinstance(settings, list | tuple):
+        for value in settings:
+            yield from _targets(value)
 
 
 def _git(*arguments: str) -> str:

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import shutil
-import sys
 import warnings
 from bisect import bisect_right
 from collections.abc import Iterable
@@ -161,8 +160,7 @@ def _fingerprint(sequence: Sequence, projection: SphericalProjection) -> str:
 
 def _code(sequence: Sequence) -> str:
     """Digest of the sequence's reader and of this module, with all that they use."""
-    reader = getattr(sys.modules.get(type(sequence).__module__), "__file__", None)  # a notebook's class has none
-    return source_digest(*(Path(file) for file in (reader, __file__) if file))
+    return source_digest(type(sequence), Path(__file__))
 
 
 def _complete(folder: Path, shape: tuple[int, ...]) -> bool:

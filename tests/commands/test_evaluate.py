@@ -12,6 +12,7 @@ import pytest
 from lidarlearn.commands import evaluate, evaluation
 from lidarlearn.commands.train import train
 from lidarlearn.data.cloud_files import read_cloud
+from lidarlearn.source_digest import source_digest
 from tests.commands.scans import SENSOR
 from tests.training.runs import configured
 
@@ -52,6 +53,21 @@ def test_a_run_with_other_settings_is_not_taken_for_this_one(call, no_plots, tmp
     assert "cv+p_f2m on 0: run anew, the run folder has it with other settings (odometry)" in printed
     settings = json.loads((tmp_path / "trajectories/cv+p_f2m/0.json").read_text())["settings"]
     assert settings["odometry"]["local_map"]["size"] == 2
+
+
+def test_a_run_of_the_user_s_own_class_is_taken_up_until_its_file_is_edited(call, no_plots, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    own = ["methods=[mine]", "+initialization.mine={_target_:my_initialization.Own}", "data.test_sequences=['0']"]
+    printed = []
+    for base in ("NoInitialization", "NoInitialization", "ConstantVelocity"):
+        (tmp_path / "my_initialization.py").write_text(
+            f"from lidarlearn.odometry.initialization import {base}\nclass Own({base}): ...\n"
+        )
+        monkeypatch.delitem(sys.modules, "my_initialization", raising=False)  # as another process begins
+        source_digest.cache_clear()
+        printed.append(call(f"hydra.run.dir={tmp_path}", *own))
+    assert ["found in the run folder" in text for text in printed] == [False, True, False]
+    assert "mine on 0: run anew, the run folder has it with other settings (code)" in printed[2]
 
 
 @pytest.mark.slow

@@ -5,6 +5,9 @@ import sys
 import pytest
 
 from lidarlearn.commands import evaluation
+from lidarlearn.commands.run_folder import code_digest
+from lidarlearn.errors import UserError
+from lidarlearn.source_digest import source_digest
 from tests.commands.scans import SENSOR
 
 
@@ -38,3 +41,37 @@ def test_basins_are_not_measured_into_a_training_either(scans, training, monkeyp
     with pytest.raises(SystemExit):
         evaluation.main()
     assert f"{training} holds a training" in capsys.readouterr().err and kept(training)
+
+
+@pytest.fixture
+def own_class(tmp_path, monkeypatch):
+    """A class outside of the package, whose file may be edited before it is digested again."""
+    monkeypatch.syspath_prepend(tmp_path)
+    source_digest.cache_clear()
+    yield tmp_path / "my_part.py"
+    sys.modules.pop("my_part", None)
+    source_digest.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"_target_": "my_part.Part"}, {"odometry": {"steps": [{"_target_": "my_part.Part", "size": 1}]}}],
+)
+def test_the_code_of_a_result_is_the_package_s_and_that_of_the_user_s_classes(own_class, settings):
+    digests = []
+    for size in (1, 2):
+        own_class.write_text(f"class Part:\n    size = {size}\n")
+        source_digest.cache_clear()
+        digests.append(code_digest(settings))
+    assert len({*digests, code_digest()}) == 3
+
+
+def test_settings_of_the_package_alone_leave_the_code_as_it_is():
+    assert (
+        code_digest({"_target_": "lidarlearn.odometry.initialization.NoInitialization"}, {"size": 1}) == code_digest()
+    )
+
+
+def test_a_class_that_is_not_there_is_named():
+    with pytest.raises(UserError, match=r"my_nowhere\.Part"):
+        code_digest({"_target_": "my_nowhere.Part"})

@@ -1,9 +1,11 @@
 """The cache of vertex maps: faithful, shared, and made again when it has to be."""
 
 import errno
+import importlib
 import multiprocessing
 import os
 import pickle
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.sequence import Scan
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection, activated
+from lidarlearn.source_digest import source_digest
 from tests.box_world import SMALL, BoxSequence
 
 
@@ -109,10 +112,31 @@ def test_a_lost_or_truncated_file_is_made_again(tmp_path, file, left, complete):
 def test_a_changed_reader_makes_another_cache(tmp_path, monkeypatch):
     first = cached_vertex_maps(CountingSequence(), SMALL, tmp_path)
     digests = []
-    monkeypatch.setattr(cache, "source_digest", lambda *files: digests.append(files) or "of other code")
+    monkeypatch.setattr(cache, "source_digest", lambda *origins: digests.append(origins) or "of other code")
     again = CountingSequence()
     assert cached_vertex_maps(again, SMALL, tmp_path).files != first.files and again.read == list(range(7))
-    assert digests[0] == (Path(__file__), Path(cache.__file__))
+    assert digests[0] == (CountingSequence, Path(cache.__file__))
+
+
+def test_a_changed_helper_of_a_reader_makes_another_cache(tmp_path, monkeypatch):
+    (tmp_path / "my_reader.py").write_text(
+        "from my_scale import SCALE\n"
+        "from lidarlearn.data.sequence import Scan\n"
+        "from tests.box_world import BoxSequence\n"
+        "class Scaled(BoxSequence):\n"
+        "    def scan(self, index):\n"
+        "        return Scan(super().scan(index).points * SCALE)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    ranges = []
+    for scale in (1.0, 0.5):
+        (tmp_path / "my_scale.py").write_text(f"SCALE = {scale}{'  ' * int(1 / scale)}\n")
+        for name in ("my_reader", "my_scale"):  # as another process begins
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        source_digest.cache_clear()
+        sequence = importlib.import_module("my_reader").Scaled("1", frames=2)
+        ranges.append(decode(cached_vertex_maps(sequence, SMALL, tmp_path)[0]).norm(dim=0).max())
+    torch.testing.assert_close(ranges[1], ranges[0] / 2, rtol=0, atol=0.01)
 
 
 @pytest.mark.filterwarnings(
