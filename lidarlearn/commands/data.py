@@ -1,11 +1,13 @@
 """`python -m lidarlearn.data check|export ...`: describe a copy of a data set, or write it in the format of another."""
 
+import argparse
 import json
 import re
 import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException, InstantiationException
@@ -14,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.text import Text
 
+from lidarlearn.commands.checkpoint_options import quoted
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.data.sequence import DataSet, LayoutReport
 from lidarlearn.errors import UserError
@@ -24,7 +27,8 @@ _USAGE = """usage:
       says what is there, what is missing and what looks odd
   python -m lidarlearn.data export data=<data set> to=<data set> to.root=DIR [data.<setting>=...] [to.<setting>=...]
       writes the sequences of the one in the native format of the other; to=folder takes suffix=.bin|.npy|.pcd|.ply,
-      where .bin and .npy hold no point times"""
+      where .bin and .npy hold no point times
+  both take --config-dir DIR, a folder of your own data/<data set>.yaml"""
 _ROLES = ("train", "val", "test")
 
 
@@ -32,30 +36,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one of the commands; exits with 0 only where it succeeded.
 
     Args:
-        arguments: the command and Hydra overrides of the group `data`; None takes those of the process.
+        arguments: the command and Hydra overrides of the group `data`, anywhere among them `--config-dir DIR`; None
+            takes those of the process.
     """
-    command, *overrides = (sys.argv[1:] if arguments is None else arguments) or [""]
+    config_folder, rest = _without_config_dir(sys.argv[1:] if arguments is None else arguments)
+    command, *overrides = rest or [""]
     console = Console(highlight=False, soft_wrap=True)
     wanted = {"check": ("data=",), "export": ("data=", "to=", "to.root=")}.get(command)
-    if wanted is None or not all(any(o.startswith(w) for o in overrides) for w in wanted):
-        console.print(f"{_USAGE}\ndata sets: {', '.join(data_groups())}", markup=False)
-        sys.exit(2)
     try:
-        succeeded = check(overrides, console) if command == "check" else export_all(overrides, console)
+        _require_folder(config_folder)
+        if wanted is None or not all(any(o.startswith(w) for o in overrides) for w in wanted):
+            console.print(f"{_USAGE}\ndata sets: {', '.join(data_groups(config_folder))}", markup=False)
+            sys.exit(2)
+        run = check if command == "check" else export_all
+        succeeded = run(overrides, console, config_folder)
     except (UserError, HydraException, OmegaConfBaseException) as error:
         console.print(f"error: {_message(error)}", markup=False)
         sys.exit(1)
     sys.exit(0 if succeeded else 1)
 
 
-def check(overrides: Sequence[str], console: Console) -> bool:
+def check(overrides: Sequence[str], console: Console, config_folder: str | None = None) -> bool:
     """Describe the data set that the overrides select; whether it can be used as configured."""
-    report = compose_data_set(overrides).check()
+    report = compose_data_set(overrides, config_folder).check()
     show(report, console)
     return report.usable
 
 
-def export_all(overrides: Sequence[str], console: Console) -> bool:
+def export_all(overrides: Sequence[str], console: Console, config_folder: str | None = None) -> bool:
     """Write the sequences of one data set in the format of another, and say how to train on them."""
     # imported late: the writers' libraries are of no use to a check
     from lidarlearn.data.export.formats import export, format_of, require_new
@@ -63,8 +71,8 @@ def export_all(overrides: Sequence[str], console: Console) -> bool:
     suffix = next((o.removeprefix("suffix=") for o in overrides if o.startswith("suffix=")), None)
     theirs_alone = ("to=", "to.", "projection@to.")
     of_target = [re.sub(r"^(projection@)?to\b", r"\1data", o) for o in overrides if o.startswith(theirs_alone)]
-    source = compose_data_set([o for o in overrides if not o.startswith((*theirs_alone, "suffix="))])
-    target = compose_data_set(of_target)
+    of_source = [o for o in overrides if not o.startswith((*theirs_alone, "suffix="))]
+    source, target = (compose_data_set(side, config_folder) for side in (of_source, of_target))
     form = format_of(target, suffix)
     theirs = matched_names(source, target)
     for name in theirs.values():
@@ -78,7 +86,8 @@ def export_all(overrides: Sequence[str], console: Console) -> bool:
         console.print(f"{mine} -> {theirs[mine]}: {len(drive)} scans", markup=False)
     if left_out := [name for name in source.names if name not in theirs]:
         console.print(f"left out, {target.title} has no more names for them: {', '.join(left_out)}", markup=False)
-    words = ["python", "train.py", *of_target]
+    folder = [] if config_folder is None else ["--config-dir", config_folder]  # all overrides stand on one side
+    words = ["python", "train.py", *folder, *of_target]
     if not any("projection" in o.partition("=")[0] for o in of_target):  # scans keep the sensor that they are of
         ours, default = asdict(source.projection), asdict(target.projection)
         words += [f"data.projection.{key}={ours[key]}" for key in ours if ours[key] != default[key]]
@@ -107,21 +116,29 @@ def matched_names(source: DataSet, target: DataSet) -> dict[str, str]:
     return {name: matched[name] for name in source.names if name in matched}
 
 
-def compose_data_set(overrides: Sequence[str]) -> DataSet:
+def compose_data_set(overrides: Sequence[str], config_folder: str | None = None) -> DataSet:
     """The data set that Hydra overrides such as `data=nclt data.root=...` describe.
+
+    Args:
+        overrides: of the group `data`.
+        config_folder: of the user's own options, beside ours.
 
     Raises:
         HydraException, OmegaConfBaseException: no such data set or setting.
     """
     # Without a primary config there is no default to replace: the group is added.
     added = [f"+{override}" if override.startswith("data=") else override for override in overrides]
+    if config_folder is not None:
+        place = quoted(f"file://{Path(config_folder).absolute().as_posix()}")
+        added.append(f"hydra.searchpath=[{place}]")
     with initialize_config_dir(str(config_directory().absolute()), version_base="1.3"):
         return instantiate(compose(overrides=added).data)
 
 
-def data_groups() -> list[str]:
-    """Names that `data=` takes."""
-    return sorted(path.stem for path in (config_directory() / "data").glob("*.yaml"))
+def data_groups(config_folder: str | None = None) -> list[str]:
+    """Names that `data=` takes, those of the user's own options among them."""
+    folders = [config_directory()] if config_folder is None else [config_directory(), Path(config_folder)]
+    return sorted({path.stem for folder in folders for path in (folder / "data").glob("*.yaml")})
 
 
 def show(report: LayoutReport, console: Console) -> None:
@@ -136,6 +153,20 @@ def show(report: LayoutReport, console: Console) -> None:
         missing = sum(finding.level == "missing" for finding in report.findings)
         remedy = report.remedy or "mend what is listed as missing"
         console.print(Text(f"NOT usable as configured ({missing} missing). change: {remedy}", style="bold"))
+
+
+def _without_config_dir(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The folder of the user's own options, wherever it is named, and the other arguments."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config-dir", nargs="?", const="")
+    flags, others = parser.parse_known_args(arguments)
+    return flags.config_dir, others
+
+
+def _require_folder(config_folder: str | None) -> None:
+    if config_folder is not None and (not config_folder or not Path(config_folder).is_dir()):
+        seen = f"no such folder: {Path(config_folder).absolute()}" if config_folder else "no folder is named"
+        raise UserError(f"--config-dir: {seen}.\n  change: --config-dir to the folder that holds your data/*.yaml")
 
 
 def _message(error: Exception) -> str:

@@ -141,6 +141,52 @@ def test_a_simulated_name_that_is_none_is_found_by_the_check(capsys):
     assert code == 1 and "no simulated sequence 'town_1'" in printed and "data.test_sequences to names" in printed
 
 
+@pytest.fixture
+def my_configs(tmp_path):
+    place = tmp_path / "my configs, $all" / "data" / "mine.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text("defaults:\n  - folder\n  - override /projection@projection: vlp16\n  - _self_\n")
+    write_float32(tmp_path / "scans" / "drive" / "0.bin", [[1, 2, 0.1]])
+    return place.parent.parent
+
+
+@pytest.mark.parametrize("place", [0, 1, 2, 3])
+@pytest.mark.parametrize("written", [("--config-dir", "{}"), ("--config-dir={}",)])
+def test_a_data_set_in_a_folder_of_ones_own(my_configs, tmp_path, capsys, place, written):
+    arguments = ["check", "data=mine", f"data.root={tmp_path}/scans"]
+    arguments[place:place] = [word.format(my_configs) for word in written]
+    code, printed = run(capsys, *arguments)
+    assert code == 0 and "usable as configured" in printed
+    overrides = ["data=mine", f"data.root={tmp_path}/scans"]
+    assert compose_data_set(overrides, str(my_configs)).projection.height == 16
+
+
+def test_a_folder_of_ones_own_may_be_named_from_where_one_is(my_configs, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, printed = run(capsys, "check", "data=mine", "data.root=scans", "--config-dir", my_configs.name)
+    assert code == 0 and "usable as configured" in printed
+
+
+def test_data_sets_of_ones_own_are_listed(my_configs, capsys):
+    code, printed = run(capsys, "check", "--config-dir", str(my_configs))
+    assert code == 2 and "take --config-dir DIR" in printed and "kitti_raw, mine, nclt" in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--config-dir", "nowhere", "check", "data=mine"], "no such folder: {}/nowhere"),
+        (["check", "data=mine", "--config-dir=mine.yaml"], "no such folder: {}/mine.yaml"),
+        (["check", "data=mine", "--config-dir"], "no folder is named"),
+    ],
+)
+def test_a_folder_of_ones_own_that_is_not_there(tmp_path, capsys, monkeypatch, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").touch()
+    code, printed = run(capsys, *arguments)
+    assert code == 1 and printed.startswith("error: --config-dir: " + said.format(tmp_path))
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [

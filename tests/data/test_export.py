@@ -134,6 +134,21 @@ def test_the_printed_command_trains_with_the_image_of_the_sensor(chosen, tmp_pat
     assert compose_data_set(words).projection == asked_for.projection
 
 
+def test_the_printed_command_finds_a_data_set_of_ones_own(tmp_path, capsys):
+    (tmp_path / "my configs" / "data").mkdir(parents=True)
+    for name, default in (("mine", "folder"), ("theirs", "kitti_00-08")):
+        text = f"defaults:\n  - {default}\n  - override /projection@projection: vlp16\n"
+        (tmp_path / "my configs" / "data" / f"{name}.yaml").write_text(text)
+    write_folder(tmp_path / "scans")
+    flag, folder = "--config-dir", str(tmp_path / "my configs")
+    source, target = ("data=mine", f"data.root={tmp_path}/scans"), ("to=theirs", f"to.root={tmp_path}/kitti")
+    assert run(*source, flag, folder, *target) == 0
+    words = shlex.split(capsys.readouterr().out.split("train.py ")[1])
+    assert words[:3] == [flag, folder, "data=theirs"]
+    data = compose_data_set(words[2:], folder)
+    assert data.projection.height == 16 and [len(data.sequence(name)) for name in data.names] == [2, 2]
+
+
 @pytest.mark.parametrize("period", [0.1, 0.05])
 def test_times_of_points_and_scans_agree_in_a_folder(period, tmp_path):
     drive = simulated(replace(hdl64(128), period=period), True, frames=3)
