@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def check(overrides: Sequence[str], console: Console, config_folder: str | None = None) -> bool:
     """Describe the data set that the overrides select; whether it can be used as configured."""
-    report = compose_data_set(overrides, config_folder).check()
+    report = compose_data_set(overrides, config_folder).full_check()
     show(report, console)
     return report.usable
 
@@ -78,7 +78,7 @@ def export_all(overrides: Sequence[str], console: Console, config_folder: str | 
     for name in theirs.values():
         require_new(target, name)
     source.prepare(theirs)
-    drives = {name: source.sequence(name) for name in theirs}
+    drives = source.sequences(theirs)
     for mine, drive in drives.items():  # all, before the first is written: half an export would be in its own way
         form.require(drive, target, theirs[mine])
     for mine, drive in drives.items():

@@ -4,11 +4,9 @@ from abc import abstractmethod
 from pathlib import Path
 
 from lidarlearn.data import layout
-from lidarlearn.data.errors import ROOT_REMEDY, DataSetNotFoundError, one_line
-from lidarlearn.data.field_of_view import misfit
+from lidarlearn.data.errors import ROOT_REMEDY, DataSetNotFoundError
 from lidarlearn.data.scan_files import ScanFiles
-from lidarlearn.data.sequence import DataSet, LayoutReport, Sequence
-from lidarlearn.errors import UserError
+from lidarlearn.data.sequence import DataSet, LayoutReport
 
 
 class DataSetOnDisk(DataSet):
@@ -21,6 +19,7 @@ class DataSetOnDisk(DataSet):
 
     source: str
     marker: str
+    check_opens = True
 
     @staticmethod
     @abstractmethod
@@ -35,10 +34,6 @@ class DataSetOnDisk(DataSet):
     def check_sequence(self, report: LayoutReport, name: str) -> None:
         """Add what the names and sizes of a configured sequence's files tell."""
 
-    def open_for_check(self, name: str) -> Sequence:
-        """Open a sequence as far as a check can wait for it."""
-        return self.sequence(name)
-
     def check(self) -> LayoutReport:
         """Describe this copy by names and sizes; where these are in order, open each configured sequence.
 
@@ -52,7 +47,7 @@ class DataSetOnDisk(DataSet):
             layout.describe_unconfigured(report, found, self.names)
             layout.suggest_sequences(report, found)
             if report.usable:
-                self._open_all(report)
+                self.open_all(report)
         return report
 
     def not_found(self, name: str, missing: str) -> DataSetNotFoundError:
@@ -78,14 +73,3 @@ class DataSetOnDisk(DataSet):
     def _whole(self) -> dict[str, ScanFiles]:
         """The sequences with at least one scan."""
         return {name: scans for name, scans in self.found().items() if len(scans)}
-
-    def _open_all(self, report: LayoutReport) -> None:
-        for name in self.names:
-            try:
-                points = self.open_for_check(name).scan(0).points
-                remark = misfit(name, points, self.projection) if len(points) else "its first scan has no return"
-            except UserError as problem:
-                report.missing(name, one_line(problem))
-            else:
-                if remark is not None:
-                    report.odd(name, one_line(remark))

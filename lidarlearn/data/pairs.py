@@ -80,7 +80,10 @@ def _by_row(rows: Sequence[range], T_world_lidar: Sequence[Float[Tensor, "_ 4 4"
     """The pose of each row; not a number for those of other sequences."""
     by_row = torch.full((max((r.stop for r in rows), default=0), 4, 4), torch.nan, dtype=torch.float64)
     for scans, poses in zip(rows, T_world_lidar, strict=True):
-        if len(poses) != len(scans) or not poses.isfinite().all():
-            raise ValueError(f"{len(scans)} scans need as many finite ground-truth poses, got {len(poses)}")
+        finite = int(poses.isfinite().all(-1).all(-1).sum())
+        if not len(poses) == len(scans) == finite:
+            raise ValueError(
+                f"{len(scans)} scans need as many finite ground-truth poses, got {len(poses)}, {finite} of them finite"
+            )
         by_row[scans.start : scans.stop] = poses
     return by_row

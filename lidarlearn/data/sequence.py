@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data.errors import require_count
+from lidarlearn.data.contract import require_points, require_poses, require_timestamps
+from lidarlearn.data.errors import one_line, require_count
 from lidarlearn.data.field_of_view import misfit
 from lidarlearn.data.scan_files import sequence_names
 from lidarlearn.errors import UserError
@@ -88,6 +89,16 @@ class Sequence(ABC):
             )
         return found
 
+    def require_contract(self, first: Scan) -> None:
+        """Raise a UserError unless poses, times and a scan are what is said above: not every reader is ours.
+
+        Args:
+            first: the first scan, or the first with a return.
+        """
+        require_poses(self.name, self.T_world_lidar, len(self))
+        require_timestamps(self.name, self.timestamps, len(self))
+        require_points(self.name, first.points, first.times)
+
     @property
     @abstractmethod
     def fingerprint(self) -> str:
@@ -146,6 +157,7 @@ class DataSet(ABC):
     Attributes:
         title: the data set, as its authors call it.
         digits: to which names that arrive as numbers are filled up.
+        check_opens: whether `check` opens the sequences itself, or has a reason not to; where not, `full_check` does.
 
     Args:
         root: where it lies; `~` is the home folder.
@@ -163,6 +175,7 @@ class DataSet(ABC):
 
     title: str
     digits: int = 0
+    check_opens: bool = False
 
     def __init__(
         self,
@@ -200,10 +213,13 @@ class DataSet(ABC):
 
         Raises:
             DataSetNotFoundError, DamagedFileError: see `sequence`; or the first scan of one cannot be read.
-            UserError: none of the scans of one has a return.
+            UserError: none of the scans of one has a return, or it is not what `Sequence` and `Scan` say.
         """
         opened = {name: self.sequence(name) for name in names}
-        remarks = (misfit(name, sequence.first_returns().points, self.projection) for name, sequence in opened.items())
+        first = {name: sequence.first_returns() for name, sequence in opened.items()}
+        for name, sequence in opened.items():
+            sequence.require_contract(first[name])
+        remarks = (misfit(name, scan.points, self.projection) for name, scan in first.items())
         if remark := next(filter(None, remarks), None):
             _log.warning(remark)
         return opened
@@ -220,6 +236,32 @@ class DataSet(ABC):
     @abstractmethod
     def check(self) -> LayoutReport:
         """Describe this copy: found, missing, odd. Of each sequence's scans a few are read at most."""
+
+    def full_check(self) -> LayoutReport:
+        """`check`, and where it misses nothing, whether each configured sequence is what `Sequence` and `Scan` say."""
+        report = self.check()
+        if report.usable and not self.check_opens:
+            self.open_all(report)
+        return report
+
+    def open_all(self, report: LayoutReport) -> None:
+        """Open each configured sequence for a check; add what is wrong with its poses, times and first scan."""
+        for name in self.names:
+            try:
+                sequence = self.open_for_check(name)
+                scan = next(iter(sequence), None) or sequence.first_returns()  # which tells that there is none
+                sequence.require_contract(scan)
+                points = scan.points
+                remark = misfit(name, points, self.projection) if len(points) else "its first scan has no return"
+            except UserError as problem:
+                report.missing(name, one_line(problem))
+            else:
+                if remark is not None:
+                    report.odd(name, one_line(remark))
+
+    def open_for_check(self, name: str) -> Sequence:
+        """Open a sequence as far as a check can wait for it."""
+        return self.sequence(name)
 
     def prepare(self, names: Iterable[str] | None = None) -> None:  # noqa: B027 - most data sets have nothing to do
         """Make what can be made on the spot (simulated scans); called once, before any sequence is opened.

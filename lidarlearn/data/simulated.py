@@ -99,6 +99,7 @@ class SimulatedDataSet(DataSet):
     """
 
     title = "simulated"
+    check_opens = True  # there is nothing to open before the scans are made
 
     def __init__(
         self,

@@ -59,9 +59,9 @@ def test_no_ground_truth_no_label():
 
 
 def test_poses_that_do_not_belong_to_the_scans_are_refused(poses):
-    with pytest.raises(ValueError, match="finite ground-truth poses, got 4"):
+    with pytest.raises(ValueError, match="finite ground-truth poses, got 4, 4 of them finite"):
         ScanPairs(ROWS, [poses[0][:-1], *poses[1:]])
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ValueError, match="got 5, 0 of them finite"):
         ScanPairs(ROWS, [poses[0] * torch.nan, *poses[1:]])
 
 

@@ -1,0 +1,128 @@
+import logging
+from dataclasses import replace
+
+import pytest
+import torch
+from rich.console import Console
+
+from lidarlearn.commands import data as command
+from lidarlearn.data.datamodule import OdometryDataModule
+from lidarlearn.data.kitti import KittiOdometry
+from lidarlearn.data.sequence import Scan
+from lidarlearn.errors import UserError
+from tests.box_world import SMALL, BoxDrives, BoxSequence
+from tests.data.writers import write_kitti_odometry
+
+FRAMES = 6
+POSES = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
+LOST = POSES.clone()
+LOST[2, 0, 3], LOST[4, 1, 1] = torch.nan, torch.inf
+POINTS = torch.rand(50, 3) + 1
+
+DOUBLE_4X4, SINGLE_3 = "not a float64 tensor of (6, 4, 4)", "not a float32 tensor of (n, 3)"
+
+BROKEN = {
+    "poses in single precision": ("T_world_lidar", POSES.float(), f"is a float32 tensor of (6, 4, 4), {DOUBLE_4X4}"),
+    "poses of numpy": ("T_world_lidar", POSES.numpy(), f"is a float64 numpy.ndarray of (6, 4, 4), {DOUBLE_4X4}"),
+    "poses in a list": ("T_world_lidar", POSES.tolist(), f"is a list, {DOUBLE_4X4}"),
+    "too few poses": ("T_world_lidar", POSES[:4], f"is a float64 tensor of (4, 4, 4), {DOUBLE_4X4}"),
+    "no matrices": ("T_world_lidar", POSES[:, :3], f"is a float64 tensor of (6, 3, 4), {DOUBLE_4X4}"),
+    "unknown poses": ("T_world_lidar", LOST, "not finite in 2 of its 6 poses, first in that of scan 2"),
+    "too few timestamps": ("timestamps", torch.zeros(5), "timestamps is a float32 tensor of (5), not a tensor of (6)"),
+    "timestamps in a list": ("timestamps", [0.1] * FRAMES, "timestamps is a list, not a tensor of (6)"),
+    "points in double precision": ("points", POINTS.double(), f"is a float64 tensor of (50, 3), {SINGLE_3}"),
+    "points of numpy": ("points", POINTS.numpy(), f"is a float32 numpy.ndarray of (50, 3), {SINGLE_3}"),
+    "four columns": ("points", torch.ones(50, 4), f"is a float32 tensor of (50, 4), {SINGLE_3}"),
+    "too few point times": ("times", torch.zeros(49), "times is a float32 tensor of (49), not a tensor of (50)"),
+}
+
+
+class OwnSequence(BoxSequence):
+    """What a reader of one's own may give."""
+
+    def __init__(self, name, frames, attribute, value):
+        super().__init__(name, FRAMES)
+        self._poses = self._poses[:frames]
+        self.first = Scan(POINTS)
+        if attribute in ("points", "times"):
+            object.__setattr__(self.first, attribute, value)  # past the checks of types that tests alone have
+        elif attribute is not None:
+            setattr(self, attribute, value)
+
+    def scan(self, index):
+        return self.first
+
+
+class OwnDrives(BoxDrives):
+    """Drives of which sequence "1" is broken; their own `check` does not see it."""
+
+    def __init__(self, attribute=None, value=None, frames=FRAMES):
+        super().__init__(frames)
+        self.broken = (attribute, value)
+
+    def sequence(self, name):
+        return OwnSequence(name, self.frames, *(self.broken if name == "1" else (None, None)))
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_what_a_reader_gives_is_checked_before_work_begins(case):
+    attribute, value, said = BROKEN[case]
+    with pytest.raises(UserError) as error:
+        OwnDrives(attribute, value).sequences(["0", "1"])
+    assert str(error.value).startswith("1: ") and said in str(error.value) and "change: its reader" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value"),
+    [
+        (None, None),
+        ("T_world_lidar", None),
+        ("timestamps", None),
+        ("timestamps", torch.arange(FRAMES)),
+        ("times", torch.zeros(50)),
+    ],
+)
+def test_what_may_be_absent_or_of_any_type(attribute, value):
+    data = OwnDrives(attribute, value)
+    assert len(data.sequences(["0", "1"])) == 2 and data.full_check().usable
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_the_check_tells_it_although_ones_own_does_not(case, monkeypatch, capsys):
+    attribute, value, said = BROKEN[case]
+    monkeypatch.setattr(command, "compose_data_set", lambda *_: OwnDrives(attribute, value))
+    assert OwnDrives(attribute, value).check().usable
+    assert not command.check([], Console(soft_wrap=True))
+    printed = capsys.readouterr().out
+    assert said in printed and "NOT usable" in printed and printed.count("missing ") == 1
+
+
+def test_the_check_tells_of_a_sequence_without_scans():
+    findings = [finding.detail for finding in OwnDrives(frames=0).full_check().findings if finding.level == "missing"]
+    assert len(findings) == 3 and "none of its 0 scans has a single return" in findings[0]
+
+
+def test_the_check_opens_the_sequences_of_ones_own_for_their_image(caplog):
+    data = OwnDrives()
+    data.projection = replace(SMALL, fov_up_deg=2.0, fov_down_deg=-2.0)
+    report = data.full_check()
+    assert report.usable and "lie outside the image" in report.findings[0].detail
+    with caplog.at_level(logging.WARNING):
+        data.sequences(["0"])
+    assert "lie outside the image" in caplog.text
+
+
+def test_a_training_refuses_poses_that_are_not_numbers(tmp_path):
+    datamodule = OdometryDataModule(OwnDrives("T_world_lidar", LOST), cache_root=str(tmp_path))
+    with pytest.raises(UserError, match="first in that of scan 2"):
+        datamodule.prepare_data()
+    assert not list(tmp_path.iterdir())
+
+
+def test_sequences_that_a_check_opened_are_not_opened_again(tmp_path, monkeypatch):
+    write_kitti_odometry(tmp_path)
+    opened = []
+    data = KittiOdometry(tmp_path, SMALL, ["04"], ["04"], ["04"], None, False, 0.0)
+    sequence = data.sequence
+    monkeypatch.setattr(data, "sequence", lambda name: (opened.append(name), sequence(name))[1])
+    assert data.full_check().usable and opened == ["04"]
