@@ -25,13 +25,13 @@ class TrajectoryError(UserError):
     """A trajectory file that is missing, cannot be read, or does not belong to its sequence."""
 
 
-def write_kitti(path: Path, T_world: Float[Tensor, "n 4 4"]) -> None:
+def write_kitti(path: Path | str, T_world: Float[Tensor, "n 4 4"]) -> None:
     """Write poses in KITTI's format: the 12 numbers of the upper 3x4 matrix a row, 13 significant digits."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     np.savetxt(path, T_world[:, :3].flatten(1).cpu().numpy(), fmt="%.12e")
 
 
-def write_tum(path: Path, T_world: Float[Tensor, "n 4 4"], timestamps: Float[Tensor, "n"] | None) -> None:
+def write_tum(path: Path | str, T_world: Float[Tensor, "n 4 4"], timestamps: Float[Tensor, "n"] | None) -> None:
     """Write poses in TUM's format: time [s], position [m], quaternion (x y z w), w >= 0.
 
     Args:
@@ -40,6 +40,7 @@ def write_tum(path: Path, T_world: Float[Tensor, "n 4 4"], timestamps: Float[Ten
         timestamps: of each pose [s]; None writes the number of the frame in its place.
     """
     times = torch.arange(len(T_world), dtype=torch.float64) if timestamps is None else timestamps
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8") as file:
         file.write("# time [s] tx ty tz [m] qx qy qz qw\n")

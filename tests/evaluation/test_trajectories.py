@@ -62,6 +62,13 @@ def test_tum_without_times_counts_frames(tmp_path, poses):
     assert np.loadtxt(path)[:, 0].tolist() == list(range(30))
 
 
+def test_files_may_be_named_by_a_string(tmp_path, poses):
+    write_kitti(f"{tmp_path}/new/00.txt", poses)
+    write_tum(f"{tmp_path}/newer/00.tum", poses, TIMES)
+    for path in (tmp_path / "new" / "00.txt", tmp_path / "newer" / "00.tum"):
+        assert torch.allclose(read_trajectory(path), poses, rtol=1e-10, atol=1e-10)
+
+
 def test_each_scan_takes_the_tum_pose_nearest_in_time(tmp_path, poses):
     path = tmp_path / "00.tum"
     write_tum(path, poses, TIMES)
