@@ -27,7 +27,7 @@ from lidarlearn.metrics.relative import relative_errors, speeds
 
 Poses = Float[Tensor, "n 4 4"]
 
-_DPI = 120
+_DPI, _LINE_INCHES = 120, 0.215  # of a legend
 _TRUTH = "#4d4d4d"
 # Okabe and Ito's palette, told apart with any colour vision; the line style changes when it is used up.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
@@ -46,15 +46,14 @@ def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str
     truth = None if T_true is None else _bird_eye(T_true)
     paths = {method: _bird_eye(T_world) for method, T_world in T_estimates.items()}
     lower, upper = _view([*paths.values(), *([] if truth is None else [truth])], truth)
-    width, height = (upper - lower).tolist()
-    figure = Figure(figsize=(9, 7 * height / width + 0.5), dpi=_DPI, layout="constrained")
+    (left, bottom), (right, top) = lower.tolist(), upper.tolist()
+    figure = Figure(figsize=(9, 7 * (top - bottom) / (right - left) + 0.5), dpi=_DPI, layout="constrained")
     axes = figure.add_subplot()
     if truth is not None:
         axes.plot(*truth.mT.numpy(), color=_TRUTH, linewidth=4, alpha=0.45, label="ground truth")
     for i, (method, path) in enumerate(paths.items()):
         axes.plot(*path.mT.numpy(), linewidth=1.5, label=method, **_line(i))
     axes.plot(0, 0, marker="o", markersize=7, color="black", linestyle="none", label="start", zorder=5)
-    (left, bottom), (right, top) = lower.tolist(), upper.tolist()
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     _legend_beside(figure, axes)
     finish(axes, title, "x, forward at the start [m]", "y, left at the start [m]")
@@ -227,8 +226,9 @@ def finish(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def _legend_beside(figure: Figure, axes: Axes) -> None:
-    """A legend where it hides nothing; one for several axes that show the same methods."""
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
+    """A legend where it hides nothing, on a figure that is high enough; one for axes that show the same methods."""
+    legend = figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
+    figure.set_figheight(max(figure.get_figheight(), _LINE_INCHES * (len(legend.texts) + 1)))
 
 
 def _bird_eye(T_world: Poses) -> Float[Tensor, "n 2"]:

@@ -52,6 +52,13 @@ def test_labels_of_a_drive_of_any_shape_are_on_the_picture(tmp_path, scale):
         assert min(box.x0, box.y0) >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height
 
 
+def test_the_legend_of_all_methods_is_on_the_picture(make_drive):
+    T = make_drive(50)
+    figure = trajectory_figure("a", T, {f"posenet+method_{i}": T for i in range(24)})
+    box = figure.legends[0].get_window_extent()
+    assert box.y0 >= 0 and box.y1 <= figure.bbox.height and len(figure.legends[0].texts) == 26
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_trajectories_of_hardly_any_pose(make_drive, frames):
     T = make_drive(frames)
