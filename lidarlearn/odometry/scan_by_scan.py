@@ -64,8 +64,9 @@ def as_scan(
     times = _as_tensor(times, points.device)
     if times.shape != points.shape[:1]:
         raise ValueError(f"register_scan: times must be ({len(points)},) as the points, but are {tuple(times.shape)}")
-    finite = times[times.isfinite()]
-    if are_shares_of_a_period(finite).sum() * 2 < len(finite):
+    is_finite = times.isfinite()
+    if 2 * are_shares_of_a_period(times).sum() < is_finite.sum():
+        finite = times[is_finite]
         raise ValueError(
             "register_scan: times must be shares of the scan period, e.g. -0.5 at its beginning and 0.5 at its end, "
             f"but are {finite.min():g} to {finite.max():g}"

@@ -112,7 +112,8 @@ class ProgressLines(ProgressBar):
 
 def time_left_s(trainer: Trainer) -> float | None:
     """Seconds of `trainer.max_time` that are left, None without such a limit."""
-    timers = (callback for callback in trainer.callbacks if isinstance(callback, Timer))  # type: ignore[attr-defined]
+    callbacks = trainer.callbacks  # type: ignore[attr-defined]  # Lightning sets it without declaring it
+    timers = (callback for callback in callbacks if isinstance(callback, Timer))
     return min((left for timer in timers if (left := timer.time_remaining()) is not None), default=None)
 
 

@@ -57,6 +57,14 @@ def composed(folder: Path, checkpoint: Path, *overrides: str, program: str = "tr
         return compose(program, arguments[1:])
 
 
+def option_of_the_user(tmp_path: Path, name: str, content: str) -> str:
+    """Write an option into a folder beside the project's; the override by which it is found."""
+    place = tmp_path / "my, options" / name
+    place.parent.mkdir(parents=True)
+    place.write_text(content)
+    return f"hydra.searchpath=['file://{tmp_path}/my, options']"
+
+
 def test_a_training_goes_on_as_it_was_configured(checkpoint, tmp_path, monkeypatch):
     monkeypatch.setenv("LIDARLEARN_DATA", "/elsewhere")
     config = composed(tmp_path / "o", checkpoint)
@@ -80,10 +88,8 @@ def test_settings_of_the_module_are_kept_and_can_be_changed(checkpoint, tmp_path
 
 @pytest.mark.parametrize("program", ["train", "evaluate"])
 def test_an_experiment_that_chooses_no_data_leaves_them_to_the_checkpoint(checkpoint, tmp_path, program):
-    place = tmp_path / "mine" / "experiment" / "seeded.yaml"
-    place.parent.mkdir(parents=True)
-    place.write_text("# @package _global_\nseed: 3\n")
-    overrides = [f"hydra.searchpath=['file://{tmp_path}/mine']", "experiment=seeded"]
+    folder = option_of_the_user(tmp_path, "experiment/seeded.yaml", "# @package _global_\nseed: 3\n")
+    overrides = [folder, "experiment=seeded"]
     config = composed(tmp_path / "o", checkpoint, *overrides, program=program)
     assert (config.seed, config.data.max_frames) == (3, FRAMES)
     chosen = "network/simulated_mapping" if program == "train" else "paper/kitti_sim"
@@ -134,10 +140,8 @@ def test_options_are_found_wherever_temporary_files_lie(checkpoint, tmp_path, fo
 
 @pytest.mark.parametrize("program", ["train", "evaluate"])
 def test_options_of_the_user_are_found_too(checkpoint, tmp_path, program):
-    place = tmp_path / "my, options" / "projection" / "mine.yaml"
-    place.parent.mkdir(parents=True)
-    place.write_text("defaults: [hdl64@_here_, _self_]\nheight: 17\n")
-    overrides = [f"hydra.searchpath=['file://{tmp_path}/my, options']", "projection@data.projection=mine"]
+    folder = option_of_the_user(tmp_path, "projection/mine.yaml", "defaults: [hdl64@_here_, _self_]\nheight: 17\n")
+    overrides = [folder, "projection@data.projection=mine"]
     config = composed(tmp_path / "o", checkpoint, *overrides, "data=folder", program=program)
     assert config.data.projection.height == 17
     config = composed(tmp_path / "o", checkpoint, overrides[0], program=program)
