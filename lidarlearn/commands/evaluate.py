@@ -20,7 +20,7 @@ from lidarlearn.commands import entry_point
 from lidarlearn.commands.checkpoint_options import OPTION, add_data, chosen_data
 from lidarlearn.commands.device import resolve_device
 from lidarlearn.commands.protocol import describe_networks, differing_settings, evaluation_protocol, method_settings
-from lidarlearn.commands.run_folder import code_digest, require_no_training, write_run_description
+from lidarlearn.commands.run_folder import code_digest, held_run_folder, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.layout import TableLayout
@@ -73,7 +73,6 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     _seed(config.seed)
     resolve_device(config)
     run_folder = Path(config.run_dir)
-    require_no_training(run_folder)
     methods = _methods(config)
     networks = describe_networks(config, methods)
     layout: TableLayout | None = instantiate(config.table, _convert_="all")
@@ -177,7 +176,8 @@ def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
 
 def _evaluate_as_chosen(config: DictConfig) -> None:
     _require_use_of_checkpoint(config)
-    evaluate(config, chosen_data(config))
+    with held_run_folder(Path(config.run_dir)):
+        evaluate(config, chosen_data(config))
 
 
 def _require_use_of_checkpoint(config: DictConfig) -> None:

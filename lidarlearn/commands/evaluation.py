@@ -16,7 +16,7 @@ from lidarlearn.commands import entry_point
 from lidarlearn.commands.compare import compare
 from lidarlearn.commands.device import resolve_device
 from lidarlearn.commands.maps import make_maps
-from lidarlearn.commands.run_folder import require_no_training, write_run_description
+from lidarlearn.commands.run_folder import held_run_folder, write_run_description
 from lidarlearn.data.sequence import DataSet
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.convergence import basin_figure, basin_tables, convergence_basin
@@ -62,8 +62,11 @@ def measure_convergence(config: DictConfig) -> None:
     unknown = [name for name in config.backends if name not in config.odometry]
     if unknown or not config.backends:
         raise UserError(f"backends={unknown}: choose among {', '.join(config.odometry)}")
-    folder = Path(config.run_dir)
-    require_no_training(folder)
+    with held_run_folder(Path(config.run_dir)) as folder:
+        _measure_convergence(config, folder)
+
+
+def _measure_convergence(config: DictConfig, folder: Path) -> None:
     data: DataSet = instantiate(config.data)
     data.prepare(data.test_sequences)
     sequences = list(data.sequences(data.test_sequences).values())

@@ -2,9 +2,11 @@
 
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
@@ -45,13 +47,32 @@ def checkpoints_in(folder: Path) -> list[Path]:
     return sorted((folder / "checkpoints").glob("*.ckpt"))
 
 
-def require_no_training(folder: Path) -> None:
-    """Raise a `UserError` where a run folder is that of a training, which would lose what it says of itself."""
+@contextmanager
+def held_run_folder(folder: Path) -> Iterator[Path]:
+    """Keep a run folder to this process while it writes results there.
+
+    Args:
+        folder: made where missing.
+
+    Raises:
+        UserError: it is that of a training, which would lose what it says of itself, or another process holds it.
+    """
+    elsewhere = f"hydra.run.dir={folder / 'evaluation'}, or any other folder (hydra.sweep.dir or subdir with -m)"
     if checkpoints_in(folder):
         raise UserError(
             f"{folder} holds a training, whose config.yaml and git_revision.txt would be overwritten\n"
-            f"  change: hydra.run.dir={folder / 'evaluation'}, or any other folder (hydra.sweep.dir or subdir with -m)"
+            f"  change: {elsewhere}"
         )
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise UserError(f"{folder}: another process writes its results there\n  change: {elsewhere}, or wait") from None
+    try:
+        yield folder
+    finally:
+        lock.release()
 
 
 def write_run_description(folder: Path, config: DictConfig) -> None:

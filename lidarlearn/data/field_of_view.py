@@ -9,7 +9,7 @@ from lidarlearn.geometry.projection import SphericalProjection
 _TOLERATED_SHARE = 0.1  # a wrong sensor's image loses a third; the right one a few returns of its outermost beams
 
 
-def misfit(name: str, points: Float[Tensor, "n 3"], projection: SphericalProjection) -> str | None:
+def view_remark(name: str, points: Float[Tensor, "n 3"], projection: SphericalProjection) -> str | None:
     """What to say where many of a scan's points lie above or below the image; None where it fits.
 
     Args:

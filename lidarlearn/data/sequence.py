@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidarlearn.data.contract import require_points, require_poses, require_timestamps
 from lidarlearn.data.errors import one_line, require_count
-from lidarlearn.data.field_of_view import misfit
+from lidarlearn.data.field_of_view import view_remark
 from lidarlearn.data.scan_files import sequence_names
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
@@ -219,7 +219,7 @@ class DataSet(ABC):
         first = {name: sequence.first_returns() for name, sequence in opened.items()}
         for name, sequence in opened.items():
             sequence.require_contract(first[name])
-        remarks = (misfit(name, scan.points, self.projection) for name, scan in first.items())
+        remarks = (view_remark(name, scan.points, self.projection) for name, scan in first.items())
         if remark := next(filter(None, remarks), None):
             _log.warning(remark)
         return opened
@@ -252,7 +252,7 @@ class DataSet(ABC):
                 scan = next(iter(sequence), None) or sequence.first_returns()  # which tells that there is none
                 sequence.require_contract(scan)
                 points = scan.points
-                remark = misfit(name, points, self.projection) if len(points) else "its first scan has no return"
+                remark = view_remark(name, points, self.projection) if len(points) else "its first scan has no return"
             except UserError as problem:
                 report.missing(name, one_line(problem))
             else:

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from lidarlearn.commands import evaluation
-from lidarlearn.commands.run_folder import code_digest
+from lidarlearn.commands.run_folder import code_digest, held_run_folder
 from lidarlearn.errors import UserError
 from lidarlearn.source_digest import source_digest
 from tests.commands.scans import SENSOR
@@ -41,6 +41,16 @@ def test_basins_are_not_measured_into_a_training_either(scans, training, monkeyp
     with pytest.raises(SystemExit):
         evaluation.main()
     assert f"{training} holds a training" in capsys.readouterr().err and kept(training)
+
+
+def test_two_evaluations_do_not_write_into_one_folder_at_once(call, no_plots, tmp_path, capsys):
+    own = [f"hydra.run.dir={tmp_path}", "methods=[ni]", "data.test_sequences=['0']"]
+    with held_run_folder(tmp_path), pytest.raises(SystemExit):
+        call(*own)
+    error = capsys.readouterr().err
+    assert f"{tmp_path}: another process writes its results there" in error and "hydra.run.dir=" in error
+    call(*own)
+    assert (tmp_path / "results.json").is_file()
 
 
 @pytest.fixture
