@@ -142,6 +142,12 @@ def test_the_same_seed_does_the_same(pair):
     assert all(torch.equal(batches[0][key], batches[1][key]) for key in batches[0])
 
 
+def test_each_batch_loses_pixels_of_its_own(pair):
+    torch.manual_seed(0)
+    first, second = (activated(Augmentation(drop_out=0.5)(batch_of(pair, 1))["reference"]) for _ in range(2))
+    assert not torch.equal(first, second)
+
+
 def test_nothing_is_left_to_chance_that_is_switched_off(pair):
     state = torch.get_rng_state()
     batch = batch_of(pair, 2)

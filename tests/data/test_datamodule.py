@@ -101,6 +101,15 @@ def test_batches_are_the_same_where_the_maps_are_kept_on_the_device(tmp_path, au
     assert next(iter(modules[1].train_dataloader()))["reference"].shape == (4, 3, 16, 96)
 
 
+def test_pairs_are_changed_by_chance_in_training_alone(tmp_path):
+    plain, augmented = make(tmp_path), make(tmp_path, augmentation=EVERYTHING)
+    for is_training in (False, True):
+        augmented.trainer = SimpleNamespace(training=is_training)
+        for batches in zip(plain.val_dataloader()[0], augmented.val_dataloader()[0], strict=True):
+            one, other = plain.on_after_batch_transfer(batches[0], 0), augmented.on_after_batch_transfer(batches[1], 0)
+            assert all(torch.equal(one[key], other[key]) for key in one) != is_training
+
+
 @pytest.mark.parametrize(("resident", "is_kept"), [("auto", False), (True, True), (False, False)])
 def test_maps_are_kept_on_a_cpu_only_where_that_is_asked_for(tmp_path, resident, is_kept):
     rows = next(iter(make(tmp_path, resident=resident).val_dataloader()[0]))["reference"]

@@ -11,6 +11,7 @@ import torch
 
 from lidarlearn.commands.data import compose_data_set, data_groups, main, matched_names
 from lidarlearn.data.export.formats import export, format_of
+from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
 from lidarlearn.simulation import scenes
@@ -76,6 +77,37 @@ def test_round_trip(name, tmp_path):
     torch.testing.assert_close(
         read.timestamps - read.timestamps[0], drive.timestamps - drive.timestamps[0], rtol=0, atol=1e-6
     )
+
+
+class Recorded(Sequence):
+    """Scans with intensities, and poses in the frame of a camera of its own."""
+
+    name, reference_frame = "drive", "camera"
+    T_reference_lidar = se3.from_euler(torch.tensor([0.1, -0.2, 0.3, 1.5, 0.1, -1.4], dtype=torch.float64))
+    T_world_lidar = torch.from_numpy(curve(3))
+    fingerprint = ""
+
+    def __len__(self):
+        return 3
+
+    def scan(self, index):
+        return Scan(torch.from_numpy(random_points(index)), intensities=torch.linspace(0, 1, 200))
+
+
+@pytest.mark.parametrize(
+    ("name", "sequence", "setting"),
+    [("kitti_00-08", "03", ()), ("nclt", "2012-01-08", ()), ("folder", "drive", ("data.max_intensity=200",)),
+     ("ford_campus", "IJRR-Dataset-1", ("data.T_vehicle_lidar_m_deg=[2.4,-0.01,-2.3,180,0,10]",))],
+)  # fmt: skip
+def test_intensities_camera_and_mounting_come_back(name, sequence, setting, tmp_path):
+    drive, target = Recorded(), compose_data_set([f"data={name}", f"data.root={tmp_path}", *setting])
+    export(drive, target, sequence)
+    read = target.sequence(sequence)
+    torch.testing.assert_close(read.T_world_lidar, drive.T_world_lidar, rtol=0, atol=1e-6)
+    if read.reference_frame == "camera":
+        torch.testing.assert_close(read.T_reference_lidar, drive.T_reference_lidar)
+    if name != "ford_campus":  # whose files hold none
+        torch.testing.assert_close(read.scan(1).intensities, drive.scan(1).intensities, rtol=0, atol=0.5 / 255)
 
 
 @pytest.mark.parametrize("name", ["kitti_00-08", "folder"])

@@ -66,17 +66,17 @@ def test_sweep_times_run_clockwise_from_the_rear():
 
 
 def test_odometry_numbers_select_the_part_of_the_drive(tmp_path):
-    drive = ODOMETRY_DRIVES["08"]
-    write_kitti_raw(tmp_path, drive=drive.name, frames=4)
-    scans = tmp_path / drive.name[:10] / f"{drive.name}_sync" / "velodyne_points" / "data"
-    (scans / "0000000003.bin").rename(scans / "0000001100.bin")
-    data = raw(tmp_path, name="08")
-    stamps = tmp_path / drive.name[:10] / f"{drive.name}_sync" / "velodyne_points"
+    drive, numbers = ODOMETRY_DRIVES["08"], (0, 1, 1099, 1100, 5170, 5171)
+    write_kitti_raw(tmp_path, drive=drive.name, frames=6)
+    scans = tmp_path / drive.name[:10] / f"{drive.name}_sync" / "velodyne_points"
+    for i in (5, 4, 3, 2):
+        (scans / "data" / f"{i:010d}.bin").rename(scans / "data" / f"{numbers[i]:010d}.bin")
     for end in ("start", "end"):
-        lines = (stamps / f"timestamps_{end}.txt").read_text().splitlines()
-        (stamps / f"timestamps_{end}.txt").write_text("\n".join(lines[:3] + [""] * 1097 + lines[3:]) + "\n")
-    assert data.sequence("08").scans.names == ("0000001100.bin",)
-    assert len(data.sequence(drive.name)) == 4
+        lines = dict(zip(numbers, (scans / f"timestamps_{end}.txt").read_text().splitlines(), strict=True))
+        (scans / f"timestamps_{end}.txt").write_text("".join(f"{lines.get(i, '')}\n" for i in range(5172)))
+    data = raw(tmp_path, name="08")
+    assert data.sequence("08").scans.numbers == [1100, 5170]
+    assert data.sequence(drive.name).scans.numbers == [*numbers]
 
 
 def test_mercator_is_true_to_scale_at_the_first_latitude():
@@ -139,12 +139,15 @@ def test_damaged_files(tmp_path, file, content, problem):
         raw(tmp_path).sequence(DRIVE)
 
 
-def test_a_check_reads_packets_around_the_first_scan_alone(tmp_path, monkeypatch):
-    write_kitti_raw(tmp_path, frames=40)
+def test_packets_on_both_sides_of_the_scans_are_read_and_no_others(tmp_path, monkeypatch):
+    write_kitti_raw(tmp_path, frames=10, lag=-0.02)
+    for number in range(3):
+        (folder(tmp_path) / "velodyne_points" / "data" / f"{number:010d}.bin").unlink()
     read = []
     monkeypatch.setattr(kitti_raw, "read_oxts_poses", lambda packets: read.append(packets) or read_oxts_poses(packets))
     assert raw(tmp_path).check().usable
-    assert [packets.numbers for packets in read] == [[0, 1]]
+    assert raw(tmp_path, max_frames=2).sequence(DRIVE).scans.numbers == [3, 4]
+    assert [packets.numbers for packets in read] == [[3, 4], [3, 4, 5]]
 
 
 def test_scans_without_packets_have_no_ground_truth_made_up(tmp_path, caplog):

@@ -115,11 +115,14 @@ def test_clouds_that_the_ground_truth_does_not_cover_are_left_out(tmp_path, kind
     report = rosbag(tmp_path).check()
     assert report.usable
     assert "from 0.410 to 0.610 s, of scans from 0.100 to 1.000 s: those outside are left" in details(report, "odd")
-    truth.write_text(tum_rows(curve(3), [5, 6, 7]))
-    with pytest.raises(DamagedFileError, match=r"do not cover(.|\n)*one clock"):
-        rosbag(tmp_path).sequence("street")
-    report = rosbag(tmp_path).check()
-    assert not report.usable and "use one clock" in details(report, "missing")
+    truth.write_text(tum_rows(curve(3), [0.1, 0.2, 0.3]))
+    assert "those outside are left" in details(rosbag(tmp_path).check(), "odd")
+    for times in ([5, 6, 7], [-7, -6, -5]):
+        truth.write_text(tum_rows(curve(3), times))
+        with pytest.raises(DamagedFileError, match=r"do not cover(.|\n)*one clock"):
+            rosbag(tmp_path).sequence("street")
+        report = rosbag(tmp_path).check()
+        assert not report.usable and "use one clock" in details(report, "missing")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -146,9 +149,11 @@ def test_kitti_ground_truth_and_a_cut(tmp_path):
     assert np.allclose(rosbag(tmp_path).sequence("street").T_world_lidar, curve(3))
     cut = rosbag(tmp_path, max_frames=2).sequence("street")
     assert len(cut) == len(cut.T_world_lidar) == len(cut.timestamps) == 2
-    (path / "poses.txt").write_text(kitti_rows(curve(2)))
-    with pytest.raises(DamagedFileError, match="2 poses for 3 scans"):
-        rosbag(tmp_path).sequence("street")
+    for there in (2, 4):
+        (path / "poses.txt").write_text(kitti_rows(curve(there)))
+        with pytest.raises(DamagedFileError, match=f"{there} poses for 3 scans"):
+            rosbag(tmp_path).sequence("street")
+        assert f"{there} poses for 3 messages" in details(rosbag(tmp_path).check(), "odd")
 
 
 @pytest.mark.parametrize("stamps", [[0, 0, 0], [2, 1, 3]])

@@ -1,10 +1,15 @@
 """Basins of convergence."""
 
+from types import SimpleNamespace
+
 import pytest
+import torch
 
 from lidarlearn.evaluation.convergence import Probe, basin_tables, convergence_basin
+from lidarlearn.geometry import se3
 from lidarlearn.odometry import Backend, GridSampling, LocalMap
 from lidarlearn.registration.association import KdTree
+from lidarlearn.registration.gauss_newton import GaussNewton
 from tests.box_world import BoxSequence
 
 PROBE = Probe(offsets_m=(0.1, 20.0), angles_deg=(1.0, 170.0), directions=2, every=4, min_range_m=0.5)
@@ -25,6 +30,25 @@ def test_a_registration_succeeds_where_the_one_from_the_truth_ends_however_good_
         assert measured.by_angle_deg[1.0] == 1.0 and measured.by_angle_deg[170.0] < 1
         assert measured.from_truth_m == pytest.approx(off_m, abs=0.02)
         assert measured.from_truth_deg < 0.2
+
+
+class Stay(GaussNewton):
+    """Ends where it starts, and keeps what it was given."""
+
+    def register(self, points, association, T_initial, search_distance_m, normals):
+        self.points, self.T_initial = points, T_initial
+        return SimpleNamespace(T_world_lidar=T_initial)
+
+
+def test_initial_poses_lie_about_the_true_one_and_a_turned_end_is_no_success():
+    drive, stay = BoxSequence("0", 6), Stay()
+    probe = Probe(offsets_m=(1.0,), angles_deg=(10.0,), directions=2, every=4, min_range_m=3.0, max_range_m=8.0)
+    measured = convergence_basin(Backend(GridSampling(), LocalMap(KdTree()), stay), drive, probe)
+    off = torch.zeros(5, 6, dtype=torch.float64)
+    off[1:3, 0], off[3:, 5] = torch.tensor([1.0, -1.0]), torch.tensor([10.0, -10.0]).deg2rad()
+    torch.testing.assert_close(se3.to_euler(se3.inverse(drive.T_world_lidar[4]) @ stay.T_initial), off)
+    assert 3 <= stay.points.norm(dim=1).min() and stay.points.norm(dim=1).max() <= 8
+    assert measured.by_offset_m == {1.0: 0.0} and measured.by_angle_deg == {10.0: 0.0}
 
 
 def test_where_the_one_from_the_truth_ends_is_printed():

@@ -77,10 +77,11 @@ def test_the_point_is_the_mean_with_the_mean_intensity():
     torch.testing.assert_close(built.intensities, torch.tensor([0.9, 0.4]))
 
 
-def test_intensities_that_some_scans_lack_are_left_out():
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_intensities_that_some_scans_lack_are_left_out(order):
     points = torch.full((4, 3), 5.0)
-    mixed = Standing(2, Scan(points, None, torch.ones(4)), Scan(points))
-    assert standing_map(mixed).intensities is None
+    scans = (Scan(points, None, torch.ones(4)), Scan(points))
+    assert standing_map(Standing(2, *(scans[i] for i in order))).intensities is None
 
 
 def test_what_is_seen_again_takes_no_more_room():

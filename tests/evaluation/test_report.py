@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from lidarlearn.evaluation.report import details_table, drift_table, print_tables, report_tables, write_report
+from lidarlearn.evaluation.report import (
+    details_table,
+    drift_table,
+    print_tables,
+    report_tables,
+    seen_in_training,
+    write_report,
+)
 from lidarlearn.evaluation.score import Score, score
 
 PROTOCOL = {
@@ -89,6 +96,17 @@ def test_drift_table(scores):
     assert "no segment of 100 m" in notes
     assert "trained on this sequence" in notes
     assert "published" not in notes
+
+
+def test_what_a_network_was_trained_on_counts_for_every_method_with_it():
+    def network(sequence):
+        return {"trained_on": {"train_sequences": [sequence]}}
+
+    methods = ("posenet", "posenet+p_f2m", "other+kd_f2m", "cv+p_f2m")
+    rows = [Score(method, sequence, 9) for method in methods for sequence in ("a", "b")]
+    seen = seen_in_training({"checkpoint": network("a"), "networks": {"other": network("b")}}, rows)
+    assert seen == {("posenet", "a"), ("posenet+p_f2m", "a"), ("other+kd_f2m", "b")}
+    assert seen_in_training({"checkpoint": None}, rows) == set()
 
 
 def test_a_sequence_without_ground_truth_leaves_a_dash_and_says_so(scores):

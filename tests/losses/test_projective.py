@@ -91,11 +91,11 @@ def test_one_pair_without_overlap_costs_nothing_and_pulls_nowhere(loss, pair):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("far_off", [0.0, 1e4])
-def test_without_any_overlap_loss_and_gradient_are_zero(loss, far_off, pair):
-    target = pair[1] if far_off else torch.zeros_like(pair[1])
+@pytest.mark.parametrize(("shares", "far_off"), [((1, 0), 0.0), ((0, 1), 0.0), ((1, 1), 1e4)])
+def test_without_any_overlap_loss_and_gradient_are_zero(loss, shares, far_off, pair):
+    reference, target = (share * image for share, image in zip(shares, pair, strict=True))
     parameters = torch.tensor([[0.0, 0, far_off, 0, 0, 0]], requires_grad=True)
-    result = loss(parameters, pair[0], target, FINE)
+    result = loss(parameters, reference, target, FINE)
     result.loss.backward()
     assert result.loss == 0 and result.parts["activated_share"] == 0 and result.parts["misfit"] == 1
     assert (parameters.grad == 0).all()

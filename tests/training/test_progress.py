@@ -83,3 +83,17 @@ def test_the_other_processes_of_a_run_are_silent(trainer, capsys):
     bar.disable()
     run(bar, trainer)
     assert capsys.readouterr().out == ""
+
+
+def test_the_time_left_is_by_the_pace_since_this_start(trainer, capsys, monkeypatch):
+    """Of a training that goes on in its ninth epoch, too."""
+    now = [0.0]
+    monkeypatch.setattr("lidarlearn.training.progress.time.monotonic", lambda: now[0])
+    trainer.current_epoch, trainer.max_epochs = 8, 11
+    bar, module = ProgressLines(seconds_between_lines=1000.0), LightningModule()
+    bar.on_train_start(trainer, module)
+    bar.on_train_epoch_start(trainer, module)
+    now[0] = 60.0
+    bar.on_train_batch_end(trainer, module, {"loss": torch.tensor(0.5)}, None, 3)
+    bar.on_train_epoch_end(trainer, module)
+    assert capsys.readouterr().out.endswith("1 min 00 s  2 min 00 s left\n")
