@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -10,16 +10,16 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.ranges import in_range
+from lidarlearn.odometry.attempt import Attempt, Guess
 from lidarlearn.odometry.backend import Backend
 from lidarlearn.odometry.health import Health, Status
 from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
-from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
+from lidarlearn.odometry.initialization.base import Initialization
 from lidarlearn.odometry.judgement import Judgement, motion_difference
 from lidarlearn.odometry.sampling import SampledScan
 from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, are_shares_of_a_period, as_scan
-from lidarlearn.registration.result import RegistrationResult
 
-_NOT_FAR_M = 0.1  # how far off a motion may be that was found among several, or is the last one
+_CLOSE_GUESS_ERROR_M = 0.1  # `Guess.error_m` of a motion that was found among several, or of the last one
 
 
 class Odometry(ScanByScan):
@@ -68,16 +68,18 @@ class Odometry(ScanByScan):
     def register_scan(self, points: Points, times: Times | None = None) -> Frame:
         """Guess the motion, register, judge, try again if in doubt, add the scan to the map."""
         points, times = self._in_range(*as_scan(points, times, self._device))
-        guess = self._initialization.predict(points, self._motion.clone())
+        initial = self._initialization.predict(points, self._motion.clone())
+        guess = Guess(initial.T_previous_new, initial.source, max(self._surprises_m, default=math.inf))
         scan = self._backend.sampling.sample(points, times)
         if self._backend.local_map.association.is_empty:
             health = self._begin(scan)
         elif not self._has_enough_points(scan):
-            health = self._coast(self._unregistered(scan, guess.source))
+            self._coast()
+            health = self._unregistered(scan, guess.source, "coasted")
         elif self._first is not None:
             health = self._set_off(scan, self._first, guess)
         else:
-            health = self._advance(scan, guess.T_previous_new, guess.source)
+            health = self._advance(scan, guess)
         self._frames += 1
         return Frame(self._T_world_lidar.clone(), health)
 
@@ -91,76 +93,89 @@ class Odometry(ScanByScan):
         """Start a map with a scan, at the origin or, after a loss, where the motion model puts it."""
         if self._frames:
             self._move(self._motion)
-        status: Status = "ok" if self._frames == 0 else "restarted"
-        if self._has_enough_points(scan):
-            self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
-            self._first = _Beginning(scan, self._T_world_lidar)
-            self._coasting = 0
-        else:
-            status = "coasted"
-        return replace(self._unregistered(scan, "start"), status=status)
+        if not self._has_enough_points(scan):
+            return self._unregistered(scan, "start", "coasted")
+        self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
+        self._first = _Beginning(scan, self._T_world_lidar)
+        self._coasting = 0
+        return self._unregistered(scan, "start", "restarted" if self._frames else "ok")
 
-    def _set_off(self, scan: SampledScan, first: "_Beginning", guess: InitialMotion) -> Health:
+    def _set_off(self, scan: SampledScan, first: "_Beginning", guess: Guess) -> Health:
         """Register a scan to the only one there is, from motions of all kinds: none has been seen yet."""
-        T_previous_new, source = guess.T_previous_new, guess.source
         if self._recovery:
-            T_previous_new, source = self._search(scan, start_motions(T_previous_new)), "start"
+            motion = self._search(scan, start_motions(guess.T_previous_new))
+            guess = Guess(motion, "start", _CLOSE_GUESS_ERROR_M)
         if first.scan.times is not None:
-            self._deskew_first(first, scan, T_previous_new, source)
-        return self._advance(scan, T_previous_new, source)
+            self._deskew_first(first, scan, guess)
+        return self._advance(scan, guess)
 
-    def _deskew_first(self, first: "_Beginning", scan: SampledScan, T_previous_new: Tensor, source: str) -> None:
+    def _deskew_first(self, first: "_Beginning", scan: SampledScan, guess: Guess) -> None:
         """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the poses."""
-        attempt = self._register(scan, T_previous_new, source)
+        attempt = self._register(scan, guess)
         if self._judgement.accepts(attempt.result):
             self._backend.local_map.restart()
-            self._backend.local_map.update(first.scan.deskewed(self._per_scan(attempt.motion)), first.T_world_lidar)
+            self._backend.local_map.update(
+                first.scan.deskewed(self._per_scan(attempt.T_previous_new)), first.T_world_lidar
+            )
 
-    def _advance(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> Health:
+    def _advance(self, scan: SampledScan, guess: Guess) -> Health:
         """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
-        attempt = self._register(scan, T_previous_new, source)
-        if self._recovery and source != "start" and self._is_doubtful(attempt):
-            attempt = self._try_others(scan, attempt)
-        if not self._judgement.accepts(attempt.result):
-            return self._coast(attempt.health)
+        status: Status = "ok"
+        attempt = self._register(scan, guess)
+        if self._recovery and self._first is None and self._is_doubtful(attempt):
+            attempt, status = self._try_others(scan, attempt), "recovered"
+        if self._judgement.accepts(attempt.result):
+            self._accept(scan, guess, attempt)
+        else:
+            status = "coasted"
+            self._coast()
+        return attempt.health(self._frames, len(scan.queries), status)
+
+    def _accept(self, scan: SampledScan, guess: Guess, attempt: Attempt) -> None:
+        """Take over the motion, and add the scan to the map."""
         self._fits.append(attempt.result.fit.item())
-        self._surprises_m.append(_displacement_m(scan, T_previous_new, attempt.motion))
-        self._trust(attempt.motion, attempt.health)
+        self._surprises_m.append(_displacement_m(scan, guess.T_previous_new, attempt.T_previous_new))
+        self._trust(attempt)
         self._backend.local_map.update(scan.deskewed(self._motion, attempt.result.skew), self._T_world_lidar)
         self._first = None
         self._coasting = 0
-        return attempt.health
 
-    def _try_others(self, scan: SampledScan, doubtful: "_Attempt") -> "_Attempt":
+    def _try_others(self, scan: SampledScan, doubtful: Attempt) -> Attempt:
         """The most credible of a registration in doubt, one from the last motion and one from the best of many."""
-        attempts = [doubtful]
-        if not torch.equal(doubtful.T_guess, self._motion):
-            attempts.append(self._register(scan, self._motion, "recovery"))
+        attempts, T_guess = [doubtful], doubtful.guess.T_previous_new
+        if not torch.equal(T_guess, self._motion):
+            attempts.append(self._register(scan, Guess(self._motion, "recovery", _CLOSE_GUESS_ERROR_M)))
         if self._is_doubtful(attempts[-1]):
-            guesses = surprise_motions(doubtful.T_guess, self._motion)
-            attempts.append(self._register(scan, self._search(scan, guesses), "recovery"))
-        best = max(attempts, key=lambda attempt: self._credibility(scan, attempt))
-        return replace(best, health=replace(best.health, status="recovered"))
+            found = self._search(scan, surprise_motions(T_guess, self._motion))
+            attempts.append(self._register(scan, Guess(found, "recovery", _CLOSE_GUESS_ERROR_M)))
+        return max(attempts, key=lambda attempt: self._credibility(scan, attempt))
 
-    def _is_doubtful(self, attempt: "_Attempt") -> bool:
-        if attempt.health.implausible or not self._judgement.accepts(attempt.result):
+    def _is_doubtful(self, attempt: Attempt) -> bool:
+        if attempt.is_implausible or not self._judgement.accepts(attempt.result):
             return True
         if attempt.result.fit.item() < self._judgement.min_fit_share * max(self._fits, default=0.0):
             return True
         # Where the map says too little, what was guessed remains.
-        guessed = motion_difference(self._motion, attempt.T_guess)
-        return attempt.health.degenerate and not self._judgement.is_plausible(guessed)
+        guessed = motion_difference(self._motion, attempt.guess.T_previous_new)
+        return attempt.is_degenerate and not self._judgement.is_plausible(guessed)
 
-    def _register(self, scan: SampledScan, T_previous_new: Tensor, source: str) -> "_Attempt":
-        is_searched = source in ("start", "recovery")
-        surprise_m = _NOT_FAR_M if is_searched else max(self._surprises_m, default=math.inf)
-        result = self._backend.register(scan, T_previous_new, self._T_world_lidar, surprise_m, self._per_scan)
+    def _register(self, scan: SampledScan, guess: Guess) -> Attempt:
+        result = self._backend.register(scan, guess.T_previous_new, self._T_world_lidar, guess.error_m, self._per_scan)
         motion = se3.orthonormalize(torch.linalg.solve(self._T_world_lidar, result.T_world_lidar))
-        return _Attempt(T_previous_new, result, motion, self._assess(scan, result, motion, source))
+        deviation = motion_difference(self._motion, motion)
+        min_information = max(self._judgement.min_information, self._backend.registration.min_information)
+        return Attempt(
+            guess,
+            result,
+            motion,
+            deviation,
+            is_implausible=self._first is None and not self._judgement.is_plausible(deviation),
+            is_degenerate=result.information[0].item() < min_information,
+        )
 
-    def _credibility(self, scan: SampledScan, attempt: "_Attempt") -> float:
-        agreement = self._backend.agreement(scan, attempt.motion, self._T_world_lidar)
-        return self._judgement.credibility(agreement, motion_difference(self._motion, attempt.motion))
+    def _credibility(self, scan: SampledScan, attempt: Attempt) -> float:
+        agreement = self._backend.agreement(scan, attempt.T_previous_new, self._T_world_lidar)
+        return self._judgement.credibility(agreement, motion_difference(self._motion, attempt.T_previous_new))
 
     def _search(self, scan: SampledScan, guesses: Float[Tensor, "h 4 4"]) -> Tensor:
         """The most credible of the motions that several guesses lead to."""
@@ -172,21 +187,21 @@ class Odometry(ScanByScan):
         credibilities = map(self._judgement.credibility, agreements.tolist(), deviations)
         return motions[torch.tensor(list(credibilities)).argmax()]
 
-    def _coast(self, health: Health) -> Health:
+    def _coast(self) -> None:
         """Move as before; after too many scans without a registration, begin a new map."""
         self._move(self._motion)
         self._coasting += 1
         if self._coasting >= self._judgement.restart_after:
             self._backend.local_map.restart()
-        return replace(health, status="coasted")
 
-    def _trust(self, motion: Tensor, health: Health) -> None:
+    def _trust(self, attempt: Attempt) -> None:
         """Move, and take over the motion as the model of the next one if it is plausible or seen twice."""
+        motion = attempt.T_previous_new
         per_scan = self._per_scan(motion)
         self._move(motion)
         doubted, self._doubted_motion = self._doubted_motion, None
         confirmed = doubted is not None and self._judgement.is_plausible(motion_difference(doubted, motion))
-        if self._first is not None or not health.implausible or confirmed:
+        if not attempt.is_implausible or confirmed:
             self._motion = per_scan
         else:
             self._doubted_motion = motion
@@ -201,31 +216,8 @@ class Odometry(ScanByScan):
     def _move(self, motion: Tensor) -> None:
         self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ motion)
 
-    def _assess(self, scan: SampledScan, result: RegistrationResult, motion: Tensor, source: str) -> Health:
-        deviation = motion_difference(self._motion, motion)
-        information = result.information[0].item()
-        least = max(self._judgement.min_information, self._backend.registration.min_information)
-        return Health(
-            frame=self._frames,
-            initialization=source,
-            points=len(scan.queries),
-            iterations=result.iterations,
-            converged=bool(result.converged),
-            overlap=result.overlap.item(),
-            inlier_share=result.inlier_share.item(),
-            rmse_m=result.rmse_m.item(),
-            skew_m=result.skew[:3].norm().item(),
-            skew_deg=math.degrees(result.skew[3:].norm().item()),
-            min_information=information,
-            degenerate=information < least,
-            weakest_direction=tuple(result.weakest_direction.tolist()),
-            deviation_m=deviation.distance_m,
-            deviation_deg=deviation.angle_deg,
-            implausible=self._first is None and not self._judgement.is_plausible(deviation),
-        )
-
-    def _unregistered(self, scan: SampledScan, source: str) -> Health:
-        return Health(self._frames, initialization=source, points=len(scan.queries))
+    def _unregistered(self, scan: SampledScan, source: str, status: Status) -> Health:
+        return Health(self._frames, status, source, len(scan.queries))
 
     def _has_enough_points(self, scan: SampledScan) -> bool:
         return len(scan.queries) >= self._judgement.min_points
@@ -237,16 +229,6 @@ class _Beginning:
 
     scan: SampledScan
     T_world_lidar: Float[Tensor, "4 4"]
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    """A registration from a guess, the motion that it means, and what is to be thought of it."""
-
-    T_guess: Float[Tensor, "4 4"]
-    result: RegistrationResult
-    motion: Float[Tensor, "4 4"]
-    health: Health
 
 
 def _displacement_m(scan: SampledScan, T_guess: Tensor, T_previous_new: Tensor) -> float:

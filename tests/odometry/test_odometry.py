@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.odometry import Backend, GridSampling, LocalMap, Odometry
-from lidarlearn.odometry.initialization import ConstantVelocity, Initialization
+from lidarlearn.odometry.initialization import ConstantVelocity, Initialization, InitialMotion
 from lidarlearn.odometry.sampling import map_voxel_m
 from lidarlearn.odometry.scan_by_scan import InitializationAlone
 from lidarlearn.registration.association import KdTree
@@ -100,6 +100,25 @@ def test_an_initialization_may_do_with_the_last_motion_what_it_likes(alone):
         return Odometry(initialization, Backend(GridSampling(), LocalMap(KdTree())))
 
     assert torch.equal(*(poses(run(odometry(i), scans()[:4])) for i in (Spoiling(), ConstantVelocity())))
+
+
+@pytest.mark.parametrize(
+    ("source", "error", "status"),
+    [("start", [4.0, 2, 0, 0, 0, 0.3], "recovered"), ("recovery", [1.0, 0.5, 0, 0, 0, 0], "ok")],
+)
+def test_an_initialization_may_call_itself_what_it_likes(source, error, status):
+    class Wrong(Initialization):
+        def __init__(self, source):
+            self.source = source
+
+        def predict(self, points, last_motion):
+            return InitialMotion(last_motion if last_motion[0, 3] < 1 else last_motion @ T_right_wrong, self.source)
+
+    T_right_wrong = se3.from_euler(torch.tensor(error, dtype=torch.float64))
+    backend = Backend(GridSampling(), LocalMap(KdTree()))
+    frames, expected = (run(Odometry(Wrong(name), backend), scans()[:4]) for name in (source, "wrong"))
+    assert torch.equal(poses(frames), poses(expected))
+    assert [frame.health.status for frame in frames] == ["ok", "ok", status, status]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,76 @@
+"""One registration of a scan: the guess from which it began, where it ended, and what raises doubt about it."""
+
+import math
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarlearn.odometry.health import Health, Status
+from lidarlearn.odometry.judgement import MotionDifference
+from lidarlearn.registration.result import RegistrationResult
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A motion from which a scan is registered.
+
+    Args:
+        T_previous_new: the motion.
+        source: who made the guess; for the health record alone.
+        error_m: how far points may be from where the guess puts them [m].
+    """
+
+    T_previous_new: Float[Tensor, "4 4"]
+    source: str
+    error_m: float
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A registration from one guess.
+
+    Args:
+        guess: the guess.
+        result: the registration.
+        T_previous_new: the motion that it gives.
+        deviation: between that motion and constant velocity.
+        is_implausible: whether the deviation is more than a vehicle can do in one scan.
+        is_degenerate: whether the scan says too little about one direction for the motion in it to be relied on.
+    """
+
+    guess: Guess
+    result: RegistrationResult
+    T_previous_new: Float[Tensor, "4 4"]
+    deviation: MotionDifference
+    is_implausible: bool
+    is_degenerate: bool
+
+    def health(self, frame: int, points: int, status: Status) -> Health:
+        """The health record of a frame whose pose comes from this registration, or does not as it was refused.
+
+        Args:
+            frame: index of the scan.
+            points: how many points were registered.
+            status: what became of the registration.
+        """
+        result = self.result
+        return Health(
+            frame=frame,
+            status=status,
+            initialization=self.guess.source,
+            points=points,
+            iterations=result.iterations,
+            converged=bool(result.converged),
+            overlap=result.overlap.item(),
+            inlier_share=result.inlier_share.item(),
+            rmse_m=result.rmse_m.item(),
+            skew_m=result.skew[:3].norm().item(),
+            skew_deg=math.degrees(result.skew[3:].norm().item()),
+            min_information=result.information[0].item(),
+            degenerate=self.is_degenerate,
+            weakest_direction=tuple(result.weakest_direction.tolist()),
+            deviation_m=self.deviation.distance_m,
+            deviation_deg=self.deviation.angle_deg,
+            implausible=self.is_implausible,
+        )
