@@ -10,14 +10,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
-from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.text import Text
 
 from lidarlearn.commands.checkpoint_options import quoted
 from lidarlearn.commands.configs import config_directory
+from lidarlearn.commands.entry_point import readable_errors
 from lidarlearn.data.sequence import DataSet, LayoutReport
 from lidarlearn.errors import UserError
 
@@ -43,16 +42,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command, *overrides = rest or [""]
     console = Console(highlight=False, soft_wrap=True)
     wanted = {"check": ("data=",), "export": ("data=", "to=", "to.root=")}.get(command)
-    try:
+    with readable_errors("evaluate", overrides):
         _require_folder(config_folder)
         if wanted is None or not all(any(o.startswith(w) for o in overrides) for w in wanted):
             console.print(f"{_USAGE}\ndata sets: {', '.join(data_groups(config_folder))}", markup=False)
             sys.exit(2)
         run = check if command == "check" else export_all
         succeeded = run(overrides, console, config_folder)
-    except (UserError, HydraException, OmegaConfBaseException) as error:
-        console.print(f"error: {_message(error)}", markup=False)
-        sys.exit(1)
     sys.exit(0 if succeeded else 1)
 
 
@@ -126,13 +122,12 @@ def compose_data_set(overrides: Sequence[str], config_folder: str | None = None)
     Raises:
         HydraException, OmegaConfBaseException: no such data set or setting.
     """
-    # Without a primary config there is no default to replace: the group is added.
-    added = [f"+{override}" if override.startswith("data=") else override for override in overrides]
+    search_path = []
     if config_folder is not None:
         place = quoted(f"file://{Path(config_folder).absolute().as_posix()}")
-        added.append(f"hydra.searchpath=[{place}]")
+        search_path = [f"hydra.searchpath=[{place}]"]
     with initialize_config_dir(str(config_directory().absolute()), version_base="1.3"):
-        return instantiate(compose(overrides=added).data)
+        return instantiate(compose("evaluate", [*overrides, *search_path]).data)
 
 
 def data_groups(config_folder: str | None = None) -> list[str]:
@@ -167,9 +162,3 @@ def _require_folder(config_folder: str | None) -> None:
     if config_folder is not None and (not config_folder or not Path(config_folder).is_dir()):
         seen = f"no such folder: {Path(config_folder).absolute()}" if config_folder else "no folder is named"
         raise UserError(f"--config-dir: {seen}.\n  change: --config-dir to the folder that holds your data/*.yaml")
-
-
-def _message(error: Exception) -> str:
-    if isinstance(error, InstantiationException) and error.__cause__ is not None:
-        return str(error.__cause__)
-    return str(error).partition("\nConfig search path:")[0]

@@ -2,7 +2,8 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 import hydra
@@ -18,8 +19,8 @@ from lidarlearn.errors import UserError
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 
-# Causes of a failed instantiation that a setting can mend; any other is a defect and keeps its stack trace.
-_SETTINGS_AT_FAULT = (UserError, TypeError, ValueError, ImportError)
+# Causes of a failed instantiation, beside a UserError, that a setting can mend; any other is a defect and keeps its stack trace.
+_SETTINGS_AT_FAULT = (TypeError, ValueError, ImportError)
 
 
 def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[[], None] = lambda: None) -> None:
@@ -55,30 +56,42 @@ def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[
 
     os.environ[_FULL_ERROR] = "1"  # Hydra hands its errors on instead of printing them in its own way
     try:
-        prepare()
-        _application(task_with_readable_errors, config_name)()
-    except Exception as error:
-        message = readable_message(error, config_name)
-        if message is None:
-            raise
-        _exit(message)
+        with readable_errors(config_name):
+            prepare()
+            _application(task_with_readable_errors, config_name)()
     finally:
         del os.environ[_FULL_ERROR]
 
 
-def readable_message(error: Exception, config_name: str = "train") -> str | None:
+@contextmanager
+def readable_errors(config_name: str, arguments: Sequence[str] | None = None) -> Iterator[None]:
+    """Print an error that the user can mend as one message on stderr, and exit with 1; any other passes.
+
+    Args:
+        config_name: see `readable_message`.
+        arguments: likewise.
+    """
+    try:
+        yield
+    except Exception as error:
+        message = readable_message(error, config_name, arguments)
+        if message is None:
+            raise
+        _exit(message)
+
+
+def readable_message(error: Exception, config_name: str, arguments: Sequence[str] | None = None) -> str | None:
     """What to tell the user, None where the error is a defect.
 
     Args:
         error: whatever came up.
         config_name: of the primary config, about which errors of Hydra and OmegaConf are.
+        arguments: the command line, without the program's name; None takes that of the process.
     """
-    if isinstance(error, UserError):
-        return str(error)
-    if _is_misconfiguration(error):
-        return str(error)
+    cause = error.__cause__ if isinstance(error, InstantiationException) else error
+    if isinstance(cause, UserError) or _is_misconfiguration(error):
+        return str(cause)
     if isinstance(error, InstantiationException):
-        cause = error.__cause__
         if not isinstance(cause, _SETTINGS_AT_FAULT) and not _is_misconfiguration(cause):
             return None
         key = next((line for line in str(error).splitlines() if line.startswith("full_key:")), "")
@@ -87,7 +100,7 @@ def readable_message(error: Exception, config_name: str = "train") -> str | None
         remedy = "a value with '=', ',' or spaces needs quotes: 'ckpt=\"a=b.ckpt\"'"
         return f"{error.override}: {error.message.splitlines()[0]}; {remedy}"
     if isinstance(error, HydraException | OmegaConfBaseException):
-        return explanation(error, config_name, sys.argv[1:])
+        return explanation(error, config_name, sys.argv[1:] if arguments is None else arguments)
     return None
 
 

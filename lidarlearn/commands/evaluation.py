@@ -3,7 +3,6 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -94,7 +93,8 @@ def _compare(arguments: list[str]) -> None:
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder of an evaluation")
     parser.add_argument("--output", type=Path, metavar="DIR", help="where to write results.json and results.md")
     options = parser.parse_args(arguments)
-    _run(lambda: compare(options.runs, options.output))
+    with entry_point.readable_errors("evaluate"):
+        compare(options.runs, options.output)
 
 
 def _map(arguments: list[str]) -> None:
@@ -110,20 +110,6 @@ def _map(arguments: list[str]) -> None:
     parser.add_argument("overrides", nargs="*", metavar="data.KEY=VALUE", help="where the data is elsewhere: data.root")
     options = parser.parse_intermixed_args(arguments)
 
-    def make() -> None:
+    with entry_point.readable_errors("evaluate", options.overrides):
         settings = MapSettings(options.voxel, options.every, options.min_range, options.max_range)
         make_maps(options.run, options.method, options.sequence, settings, options.overrides)
-
-    _run(make)
-
-
-def _run(task: Callable[[], None]) -> None:
-    """Run a command without Hydra; what the user can mend is one message."""
-    try:
-        task()
-    except Exception as error:
-        message = entry_point.readable_message(error)
-        if message is None:
-            raise
-        print(f"error: {message}", file=sys.stderr)
-        sys.exit(1)

@@ -75,7 +75,8 @@ def _unknown_option(path: str, options: Sequence[str]) -> str:
     """There is no such option of a group; the options beside it, and the most similar one of the whole group."""
     group, _, option = path.partition("/")
     folder = config_directory() / group
-    known = sorted(p.relative_to(folder).with_suffix("").as_posix() for p in folder.rglob("*.yaml")) or list(options)
+    ours = (path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
+    known = sorted({*ours, *options})  # those of the user are among Hydra's
     beside = [other for other in known if PurePosixPath(other).parent == PurePosixPath(option).parent]
     similar = [f"{group}={other}" for other in nearest(option, known)]
     return "\n    ".join([f"there is no {group}={option}{_question(similar)}\n  options:", *(beside or options)])

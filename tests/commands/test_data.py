@@ -52,6 +52,15 @@ def run(capsys, *arguments):
     return exited.value.code, capsys.readouterr().out
 
 
+def error_of(capsys, *arguments):
+    """What is said on stderr, and nothing on stdout, which others may read."""
+    with pytest.raises(SystemExit) as exited:
+        main(arguments)
+    printed = capsys.readouterr()
+    assert exited.value.code == 1 and not printed.out and printed.err.startswith("error: ")
+    return printed.err.removeprefix("error: ")
+
+
 @pytest.mark.parametrize("name", DATA_ON_DISK)
 def test_every_data_set_composes_and_has_an_answer_to_an_absent_root(name, tmp_path, capsys):
     data = compose_data_set([f"data={name}"])
@@ -118,15 +127,15 @@ def test_scans_with_other_names_are_shown(tmp_path, capsys, name, write, sequenc
 @pytest.mark.parametrize("name", data_groups())
 @pytest.mark.parametrize("count", ["0", "-1"])
 def test_no_data_set_takes_no_scans_for_a_number_of_scans(capsys, name, count):
-    code, printed = run(capsys, "check", f"data={name}", f"data.max_frames={count}")
-    assert code == 1 and f"data.max_frames={count}" in printed and "at least 1" in printed
+    error = error_of(capsys, "check", f"data={name}", f"data.max_frames={count}")
+    assert f"data.max_frames={count}" in error and error.endswith("at least 1\n")
 
 
 @pytest.mark.parametrize("count", ["0", "null"])
 def test_a_simulated_drive_needs_a_scan(count):
     command = [sys.executable, "-m", "lidarlearn.data", "check", "data=simulated_urban", f"data.frames={count}"]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)  # here, hints of types are checked, too
-    assert done.returncode == 1 and f"error: data.frames={count}:" in done.stdout and "at least 1" in done.stdout
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True)  # here, hints of types are checked, too
+    assert done.returncode == 1 and f"error: data.frames={count}:" in done.stderr and "at least 1" in done.stderr
 
 
 @pytest.mark.parametrize("name", data_groups())
@@ -183,24 +192,35 @@ def test_data_sets_of_ones_own_are_listed(my_configs, capsys):
 def test_a_folder_of_ones_own_that_is_not_there(tmp_path, capsys, monkeypatch, arguments, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.yaml").touch()
+    assert error_of(capsys, *arguments).startswith("--config-dir: " + said.format(tmp_path))
+
+
+@pytest.mark.parametrize(("arguments", "said"), [([], "usage"), (["data=nclt"], "usage"), (["check"], "kitti_00-08")])
+def test_a_command_that_lacks_something_prints_the_usage(capsys, arguments, said):
     code, printed = run(capsys, *arguments)
-    assert code == 1 and printed.startswith("error: --config-dir: " + said.format(tmp_path))
+    assert code == 2 and said in printed
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("overrides", "said"),
     [
-        ([], 2, "usage"),
-        (["data=nclt"], 2, "usage"),
-        (["check"], 2, "kitti_00-08"),
-        (["check", "data=kity"], 1, "kitti_00-08"),
-        (["check", "data=nclt", "data.rot=/x"], 1, "data.rot"),
-        (["check", "data=nclt", "data.train_sequences=["], 1, "error"),
+        (["data=nclt2"], "there is no data=nclt2; did you mean data=nclt?\n  options:\n    folder\n"),
+        (["data=nclt", "data.deskw=true"], "there is no setting or group 'data.deskw'; did you mean data.deskew?"),
+        (["data=nclt", "data.train_sequences=["], "data.train_sequences=["),
+        (
+            ["data=nclt", "projection@data.projection=hdl46"],
+            "there is no projection=hdl46; did you mean projection=hdl",
+        ),
     ],
 )
-def test_mistakes_on_the_command_line_are_explained(capsys, arguments, code, said):
-    exit_code, printed = run(capsys, *arguments)
-    assert exit_code == code and said in printed
+def test_mistakes_are_explained_as_those_of_evaluate_py_are(capsys, overrides, said):
+    error = error_of(capsys, "check", *overrides)
+    assert error.startswith(said) and "append" not in error
+
+
+def test_a_data_set_that_is_not_there_is_sought_among_ones_own_too(my_configs, capsys):
+    error = error_of(capsys, "check", "data=mien", "--config-dir", str(my_configs))
+    assert "\n    kitti_raw\n    mine\n    nclt\n" in error
 
 
 def test_the_command_itself(tmp_path):

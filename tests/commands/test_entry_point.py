@@ -110,13 +110,13 @@ def instantiation_error(node: dict) -> InstantiationException:
 
 def test_an_unknown_argument_is_named():
     node = {"_target_": "lidarlearn.geometry.projection.SphericalProjection", "hight": 3}
-    assert "hight" in readable_message(instantiation_error(node))
+    assert "hight" in readable_message(instantiation_error(node), "evaluate")
 
 
 def test_a_value_that_is_refused_says_why():
     node = {"_target_": "lidarlearn.geometry.projection.SphericalProjection", "height": 0}
-    assert "height, width >= 1" in readable_message(instantiation_error(node))
+    assert "height, width >= 1" in readable_message(instantiation_error(node), "evaluate")
 
 
 def test_a_defect_within_a_constructor_is_no_matter_for_the_user():
-    assert readable_message(instantiation_error({"_target_": "operator.truediv", "_args_": [1, 0]})) is None
+    assert readable_message(instantiation_error({"_target_": "operator.truediv", "_args_": [1, 0]}), "evaluate") is None
