@@ -55,8 +55,8 @@ class Backend:
         scan: SampledScan,
         T_previous_new: Float[Tensor, "4 4"],
         T_world_previous: Float[Tensor, "4 4"],
-        surprise_m: float,
-        per_scan: Callable[[Tensor], Tensor] = lambda T_previous_new: T_previous_new,
+        guess_error_m: float,
+        motion_per_period: Callable[[Tensor], Tensor] = lambda T_previous_new: T_previous_new,
     ) -> RegistrationResult:
         """Register a scan from one guess of its motion.
 
@@ -67,23 +67,23 @@ class Backend:
             scan: the new scan.
             T_previous_new: the guess.
             T_world_previous: pose of the previous scan.
-            surprise_m: how far points may be from where the guess has them [m].
-            per_scan: the motion over one scan period, of that since the previous scan: less where scans were lost.
+            guess_error_m: how far points may be from where the guess puts them [m].
+            motion_per_period: gives the motion over one scan period from that since the previous pose.
         """
         final_m = self.registration.search_distance_m
-        distance_m = min(final_m + 2 * surprise_m, self.max_search_distance_m)
+        distance_m = min(final_m + 2 * guess_error_m, self.max_search_distance_m)
         T_guess = T_world_previous @ T_previous_new
-        result = self._register(scan, per_scan(T_previous_new), T_guess, distance_m)
+        result = self._register(scan, motion_per_period(T_previous_new), T_guess, distance_m)
         if scan.times is None:
             return result
         found = se3.orthonormalize(se3.inverse(T_world_previous) @ result.T_world_lidar)
-        again = self._register(scan, per_scan(found), T_world_previous @ found, final_m)
+        again = self._register(scan, motion_per_period(found), T_world_previous @ found, final_m)
         return replace(again, iterations=result.iterations + again.iterations)
 
     def _register(
-        self, scan: SampledScan, T_per_scan: Tensor, T_world_lidar: Tensor, distance_m: float
+        self, scan: SampledScan, motion_per_period: Tensor, T_world_lidar: Tensor, distance_m: float
     ) -> RegistrationResult:
-        points = scan.deskewed(T_per_scan)
+        points = scan.deskewed(motion_per_period)
         return self.registration.register(
             points[scan.queries],
             self.local_map.association,

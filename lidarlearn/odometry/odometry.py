@@ -56,32 +56,37 @@ class Odometry(ScanByScan):
         self._recovery = recovery
         self._device = torch.device(device)
         self._T_world_lidar = se3.identity()
-        self._motion = se3.identity()  # last one that was trusted
+        self._last_motion = se3.identity()  # over one scan period; the last one that was believed
         self._doubted_motion: Tensor | None = None
-        self._first: _Beginning | None = None  # the map's only scan, as long as no other was registered to it
-        self._surprises_m: deque[float] = deque(maxlen=5)
+        self._first_scan: _FirstScan | None = None  # of the map, until another scan is registered to it
+        self._guess_errors_m: deque[float] = deque(maxlen=5)
         self._fits: deque[float] = deque(maxlen=5)
         self._frames = 0
-        self._coasting = 0
+        self._coasted = 0  # scans in a row
 
     @torch.no_grad()
     def register_scan(self, points: Points, times: Times | None = None) -> Frame:
         """Guess the motion, register, judge, try again if in doubt, add the scan to the map."""
         points, times = self._in_range(*as_scan(points, times, self._device))
-        initial = self._initialization.predict(points, self._motion.clone())
-        guess = Guess(initial.T_previous_new, initial.source, max(self._surprises_m, default=math.inf))
+        initial = self._initialization.predict(points, self._last_motion.clone())
+        guess = Guess(initial.T_previous_new, initial.source, max(self._guess_errors_m, default=math.inf))
         scan = self._backend.sampling.sample(points, times)
         if self._backend.local_map.association.is_empty:
-            health = self._begin(scan)
+            health = self._start_map(scan)
         elif not self._has_enough_points(scan):
             self._coast()
             health = self._unregistered(scan, guess.source, "coasted")
-        elif self._first is not None:
-            health = self._set_off(scan, self._first, guess)
+        elif self._first_scan is not None:
+            health = self._register_second_scan(scan, self._first_scan, guess)
         else:
-            health = self._advance(scan, guess)
+            health = self._register_and_update(scan, guess)
         self._frames += 1
         return Frame(self._T_world_lidar.clone(), health)
+
+    @property
+    def _is_starting(self) -> bool:
+        """Whether the map holds a single scan: not deskewed yet, and no motion is known since."""
+        return self._first_scan is not None
 
     def _in_range(self, points: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
         kept = in_range(points, self._min_range_m, self._max_range_m)
@@ -89,129 +94,135 @@ class Odometry(ScanByScan):
             kept = kept[are_shares_of_a_period(times.index_select(0, kept))]
         return points.index_select(0, kept), None if times is None else times.index_select(0, kept)
 
-    def _begin(self, scan: SampledScan) -> Health:
-        """Start a map with a scan, at the origin or, after a loss, where the motion model puts it."""
+    def _start_map(self, scan: SampledScan) -> Health:
+        """Start a map with a scan, at the origin or, after a loss, where constant velocity puts it."""
         if self._frames:
-            self._move(self._motion)
+            self._move(self._last_motion)
         if not self._has_enough_points(scan):
             return self._unregistered(scan, "start", "coasted")
-        self._backend.local_map.update(scan.deskewed(self._motion), self._T_world_lidar)
-        self._first = _Beginning(scan, self._T_world_lidar)
-        self._coasting = 0
+        self._backend.local_map.update(scan.deskewed(self._last_motion), self._T_world_lidar)
+        self._first_scan = _FirstScan(scan, self._T_world_lidar)
+        self._coasted = 0
         return self._unregistered(scan, "start", "restarted" if self._frames else "ok")
 
-    def _set_off(self, scan: SampledScan, first: "_Beginning", guess: Guess) -> Health:
-        """Register a scan to the only one there is, from motions of all kinds: none has been seen yet."""
+    def _register_second_scan(self, scan: SampledScan, first: "_FirstScan", guess: Guess) -> Health:
+        """Register a map's second scan, trying motions of all kinds: there is no last motion to predict from."""
         if self._recovery:
             motion = self._search(scan, start_motions(guess.T_previous_new))
             guess = Guess(motion, "start", _CLOSE_GUESS_ERROR_M)
         if first.scan.times is not None:
-            self._deskew_first(first, scan, guess)
-        return self._advance(scan, guess)
+            self._deskew_first_scan(first, scan, guess)
+        return self._register_and_update(scan, guess)
 
-    def _deskew_first(self, first: "_Beginning", scan: SampledScan, guess: Guess) -> None:
-        """Compensate the first scan, too, once the motion is known: what is skewed in the map stays in the poses."""
+    def _deskew_first_scan(self, first: "_FirstScan", scan: SampledScan, guess: Guess) -> None:
+        """Deskew the map's first scan once the motion is known; its distortion would stay in every later pose."""
         attempt = self._register(scan, guess)
         if self._judgement.accepts(attempt.result):
+            points = first.scan.deskewed(self._motion_per_period(attempt.T_previous_new))
             self._backend.local_map.restart()
-            self._backend.local_map.update(
-                first.scan.deskewed(self._per_scan(attempt.T_previous_new)), first.T_world_lidar
-            )
+            self._backend.local_map.update(points, first.T_world_lidar)
 
-    def _advance(self, scan: SampledScan, guess: Guess) -> Health:
-        """Register a scan, from its guess and in doubt from others, or let the motion model carry on."""
+    def _register_and_update(self, scan: SampledScan, guess: Guess) -> Health:
+        """Register a scan, again from other motions if in doubt, and add it to the map; or else coast."""
         status: Status = "ok"
         attempt = self._register(scan, guess)
-        if self._recovery and self._first is None and self._is_doubtful(attempt):
-            attempt, status = self._try_others(scan, attempt), "recovered"
+        if self._recovery and not self._is_starting and self._is_doubtful(attempt):
+            attempt, status = self._recover(scan, attempt), "recovered"
         if self._judgement.accepts(attempt.result):
-            self._accept(scan, guess, attempt)
+            self._update(scan, guess, attempt)
         else:
             status = "coasted"
             self._coast()
         return attempt.health(self._frames, len(scan.queries), status)
 
-    def _accept(self, scan: SampledScan, guess: Guess, attempt: Attempt) -> None:
-        """Take over the motion, and add the scan to the map."""
-        self._fits.append(attempt.result.fit.item())
-        self._surprises_m.append(_displacement_m(scan, guess.T_previous_new, attempt.T_previous_new))
-        self._trust(attempt)
-        self._backend.local_map.update(scan.deskewed(self._motion, attempt.result.skew), self._T_world_lidar)
-        self._first = None
-        self._coasting = 0
-
-    def _try_others(self, scan: SampledScan, doubtful: Attempt) -> Attempt:
-        """The most credible of a registration in doubt, one from the last motion and one from the best of many."""
-        attempts, T_guess = [doubtful], doubtful.guess.T_previous_new
-        if not torch.equal(T_guess, self._motion):
-            attempts.append(self._register(scan, Guess(self._motion, "recovery", _CLOSE_GUESS_ERROR_M)))
-        if self._is_doubtful(attempts[-1]):
-            found = self._search(scan, surprise_motions(T_guess, self._motion))
-            attempts.append(self._register(scan, Guess(found, "recovery", _CLOSE_GUESS_ERROR_M)))
-        return max(attempts, key=lambda attempt: self._credibility(scan, attempt))
-
-    def _is_doubtful(self, attempt: Attempt) -> bool:
-        if attempt.is_implausible or not self._judgement.accepts(attempt.result):
-            return True
-        if attempt.result.fit.item() < self._judgement.min_fit_share * max(self._fits, default=0.0):
-            return True
-        # Where the map says too little, what was guessed remains.
-        guessed = motion_difference(self._motion, attempt.guess.T_previous_new)
-        return attempt.is_degenerate and not self._judgement.is_plausible(guessed)
-
     def _register(self, scan: SampledScan, guess: Guess) -> Attempt:
-        result = self._backend.register(scan, guess.T_previous_new, self._T_world_lidar, guess.error_m, self._per_scan)
+        result = self._backend.register(
+            scan, guess.T_previous_new, self._T_world_lidar, guess.error_m, self._motion_per_period
+        )
         motion = se3.orthonormalize(torch.linalg.solve(self._T_world_lidar, result.T_world_lidar))
-        deviation = motion_difference(self._motion, motion)
+        deviation = motion_difference(self._last_motion, motion)
         min_information = max(self._judgement.min_information, self._backend.registration.min_information)
         return Attempt(
             guess,
             result,
             motion,
             deviation,
-            is_implausible=self._first is None and not self._judgement.is_plausible(deviation),
+            is_implausible=not self._is_starting and not self._judgement.is_plausible(deviation),
             is_degenerate=result.information[0].item() < min_information,
         )
 
+    def _is_doubtful(self, attempt: Attempt) -> bool:
+        if attempt.is_implausible or not self._judgement.accepts(attempt.result):
+            return True
+        if attempt.result.fit.item() < self._judgement.min_fit_share * max(self._fits, default=0.0):
+            return True
+        # Along a degenerate direction the guess remains.
+        guessed = motion_difference(self._last_motion, attempt.guess.T_previous_new)
+        return attempt.is_degenerate and not self._judgement.is_plausible(guessed)
+
+    def _recover(self, scan: SampledScan, doubtful: Attempt) -> Attempt:
+        """The most credible of a doubtful registration, one from the last motion and one from the best of many."""
+        attempts, T_guess = [doubtful], doubtful.guess.T_previous_new
+        if not torch.equal(T_guess, self._last_motion):
+            attempts.append(self._register(scan, Guess(self._last_motion, "recovery", _CLOSE_GUESS_ERROR_M)))
+        if self._is_doubtful(attempts[-1]):
+            motion = self._search(scan, surprise_motions(T_guess, self._last_motion))
+            attempts.append(self._register(scan, Guess(motion, "recovery", _CLOSE_GUESS_ERROR_M)))
+        return max(attempts, key=lambda attempt: self._credibility(scan, attempt))
+
     def _credibility(self, scan: SampledScan, attempt: Attempt) -> float:
         agreement = self._backend.agreement(scan, attempt.T_previous_new, self._T_world_lidar)
-        return self._judgement.credibility(agreement, motion_difference(self._motion, attempt.T_previous_new))
+        return self._judgement.credibility(agreement, attempt.deviation)
 
     def _search(self, scan: SampledScan, guesses: Float[Tensor, "h 4 4"]) -> Tensor:
         """The most credible of the motions that several guesses lead to."""
-        is_map_skewed = self._first is not None  # a compensated scan would not fit one that is not
-        motions, agreements = self._backend.register_hypotheses(scan, guesses, self._T_world_lidar, not is_map_skewed)
-        if self._first is not None:
+        # A deskewed scan would not fit a map that is not deskewed itself.
+        deskews = not self._is_starting
+        motions, agreements = self._backend.register_hypotheses(scan, guesses, self._T_world_lidar, deskews)
+        if self._is_starting:  # no last motion to compare with
             return motions[agreements.argmax()]
-        deviations = [motion_difference(self._motion, motion) for motion in motions]
+        deviations = [motion_difference(self._last_motion, motion) for motion in motions]
         credibilities = map(self._judgement.credibility, agreements.tolist(), deviations)
         return motions[torch.tensor(list(credibilities)).argmax()]
 
-    def _coast(self) -> None:
-        """Move as before; after too many scans without a registration, begin a new map."""
-        self._move(self._motion)
-        self._coasting += 1
-        if self._coasting >= self._judgement.restart_after:
-            self._backend.local_map.restart()
+    def _update(self, scan: SampledScan, guess: Guess, attempt: Attempt) -> None:
+        """Move as registered, and add the scan to the map."""
+        self._fits.append(attempt.result.fit.item())
+        self._guess_errors_m.append(_guess_error_m(scan, guess.T_previous_new, attempt.T_previous_new))
+        self._accept_motion(attempt)
+        self._backend.local_map.update(scan.deskewed(self._last_motion, attempt.result.skew), self._T_world_lidar)
+        self._first_scan = None
+        self._coasted = 0
 
-    def _trust(self, attempt: Attempt) -> None:
-        """Move, and take over the motion as the model of the next one if it is plausible or seen twice."""
+    def _accept_motion(self, attempt: Attempt) -> None:
+        """Move, and predict the next motion from this one if it is plausible or seen twice in a row."""
         motion = attempt.T_previous_new
-        per_scan = self._per_scan(motion)
+        motion_per_period = self._motion_per_period(motion)
         self._move(motion)
         doubted, self._doubted_motion = self._doubted_motion, None
         confirmed = doubted is not None and self._judgement.is_plausible(motion_difference(doubted, motion))
         if not attempt.is_implausible or confirmed:
-            self._motion = per_scan
+            self._last_motion = motion_per_period
         else:
             self._doubted_motion = motion
 
-    def _per_scan(self, motion: Tensor) -> Tensor:
-        """The motion over one scan period: where scans after a map's first were lost, a share of that since then."""
-        if self._first is None or not self._coasting:
+    def _motion_per_period(self, motion: Tensor) -> Tensor:
+        """The motion over one scan period, from that since the previous pose.
+
+        They differ where scans were lost after a map's first one: their poses are predicted without a known motion, so
+        the motion since the first scan is shared out evenly.
+        """
+        if self._first_scan is None or not self._coasted:
             return motion
-        T_first_new = torch.linalg.solve(self._first.T_world_lidar, self._T_world_lidar @ motion)
-        return se3.exp(se3.log(T_first_new) / (1 + self._coasting))
+        T_first_new = torch.linalg.solve(self._first_scan.T_world_lidar, self._T_world_lidar @ motion)
+        return se3.exp(se3.log(T_first_new) / (1 + self._coasted))
+
+    def _coast(self) -> None:
+        """Move as before; after too many scans without a registration, begin a new map."""
+        self._move(self._last_motion)
+        self._coasted += 1
+        if self._coasted >= self._judgement.restart_after:
+            self._backend.local_map.restart()
 
     def _move(self, motion: Tensor) -> None:
         self._T_world_lidar = se3.orthonormalize(self._T_world_lidar @ motion)
@@ -224,14 +235,14 @@ class Odometry(ScanByScan):
 
 
 @dataclass(frozen=True)
-class _Beginning:
-    """The first scan of a map, and where it was begun."""
+class _FirstScan:
+    """The first scan of a map, as measured, and its pose."""
 
     scan: SampledScan
     T_world_lidar: Float[Tensor, "4 4"]
 
 
-def _displacement_m(scan: SampledScan, T_guess: Tensor, T_previous_new: Tensor) -> float:
+def _guess_error_m(scan: SampledScan, T_guess: Tensor, T_previous_new: Tensor) -> float:
     """How far a point at the mean range was from where the guess had it."""
-    surprise = motion_difference(T_guess, T_previous_new)
-    return surprise.distance_m + math.radians(surprise.angle_deg) * scan.mean_range_m
+    error = motion_difference(T_guess, T_previous_new)
+    return error.distance_m + math.radians(error.angle_deg) * scan.mean_range_m

@@ -87,17 +87,17 @@ class SampledScan:
         return torch.atan2(self.points[:, 1], self.points[:, 0]) / (-2 * math.pi)
 
     def deskewed(
-        self, T_previous_new: Float[Tensor, "4 4"], skew: Float[Tensor, "6"] | None = None
+        self, motion_per_period: Float[Tensor, "4 4"], skew: Float[Tensor, "6"] | None = None
     ) -> Float[Tensor, "n 3"]:
         """All points, compensated for the motion over one scan period, and for what was left over of it.
 
         Args:
-            T_previous_new: the motion; scans without times are compensated already.
+            motion_per_period: the motion; scans without times are compensated already.
             skew: see `RegistrationResult.skew`.
         """
         if skew is None or not skew.any():
-            return deskew(self.points, self.times, T_previous_new)
-        known = torch.zeros_like(skew) if self.times is None else se3.log(T_previous_new)
+            return deskew(self.points, self.times, motion_per_period)
+        known = torch.zeros_like(skew) if self.times is None else se3.log(motion_per_period)
         return deskew(self.points, self.phases, se3.exp(known + skew))
 
 

@@ -16,9 +16,9 @@ MOTION = se3.exp(torch.tensor([1.3, 0.1, -0.05, 0.01, -0.02, 0.09], dtype=torch.
 QUIET = Sensor("quiet", tuple(float(e) for e in range(10, -20, -2)), 256, range_noise=0.0, drop_out=0.0, reach=math.inf)
 
 
-def slow_deskew(points: Tensor, times: Tensor, T_previous_new: Tensor) -> Tensor:
+def slow_deskew(points: Tensor, times: Tensor, motion_per_period: Tensor) -> Tensor:
     """Point by point: where the sensor was at its instant, as a share of the motion."""
-    twist = se3.log(T_previous_new)
+    twist = se3.log(motion_per_period)
     moved = [
         se3.transform(se3.exp(t * twist), p[None].double())[0] for p, t in zip(points, times.double(), strict=True)
     ]
