@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -109,28 +110,27 @@ class GaussNewton:
         # Where functions are recorded, another number of points would take another recording, and no less time.
         is_recorded = matching.recordings(queries) is not None
         coarse = queries if is_recorded else queries.every(self.coarse_stride)
-        distance_m, iterations, found = search_distance_m, 0, None
-        while not iterations or (iterations < self.max_iterations and not converged.all()):
+        iterations, found = 0, None
+        for distance_m in self._distances_m(search_distance_m):
             iterations += 1
-            final = distance_m <= self.search_distance_m
-            distance_m = max(distance_m, self.search_distance_m)
-            equations = matching.equations(queries if final else coarse, T, distance_m, found)
-            found = equations.terms.found
-            position = position_of(equations)
+            is_final_distance, T_linearized = distance_m == self.search_distance_m, T
+            equations = matching.equations(queries if is_final_distance else coarse, T, distance_m, found)
+            position, found = position_of(equations), equations.terms.found
             step = np.where(converged[..., None], 0.0, self._step(equations, position))
-            T_last, T = T, T @ motion(step)
-            if final:
+            T = T @ motion(step)
+            if is_final_distance:
                 is_small = (lengths(step) < self._tolerances).all(-1)
                 converged = np.asarray(converged | (is_small & (equations.H != 0).any((-2, -1))))
-            distance_m *= self.narrowing
-        if not converged.all():  # else the last equations describe all of them, but for a small step
-            equations = matching.equations(queries, T, self.search_distance_m, found)
-            position, T_last = position_of(equations), T
+            if converged.all():  # the last equations describe the result, but for a small step
+                break
+        else:
+            T_linearized, equations = T, matching.equations(queries, T, self.search_distance_m, found)
+            position = position_of(equations)
         skew = np.zeros((*T.shape[:-2], 6))
         if phases is not None and self.elasticity is not None:
             elastic = self.elasticity.equations(equations, phases)
             step = self._step(elastic.pose, position_of(elastic.pose))
-            T, skew = T_last @ motion(step), elastic.skew(step)
+            T, skew = T_linearized @ motion(step), elastic.skew(step)
         return self._judge(T, skew, iterations, converged, equations, position)
 
     def agreement(
@@ -157,6 +157,12 @@ class GaussNewton:
         terms = matching.equations(Queries(points, normals), T, search_distance_m).terms
         fit, neighbours = self._fits(terms).sum(-1), terms.mask.sum(-1)
         return (fit / (neighbours + _FEW * max(len(points), 1))).cpu()
+
+    def _distances_m(self, first_m: float) -> Iterator[float]:
+        """The search distance of each iteration [m]: narrowing from the first to `search_distance_m`."""
+        for _ in range(self.max_iterations):
+            yield max(first_m, self.search_distance_m)
+            first_m *= self.narrowing
 
     def _matching(self, association: Association) -> Matching:
         return Matching(self.residual, self.weight, self.search_distance_m, association)
