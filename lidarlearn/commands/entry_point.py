@@ -19,7 +19,7 @@ from lidarlearn.errors import UserError
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 
-# Causes of a failed instantiation, beside a UserError, that a setting can mend; any other is a defect and keeps its stack trace.
+# Causes of a failed instantiation that a setting can mend, as a UserError; any other is a defect with a stack trace.
 _SETTINGS_AT_FAULT = (TypeError, ValueError, ImportError)
 
 

@@ -5,7 +5,6 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +26,12 @@ from lidarlearn.evaluation.layout import TableLayout
 from lidarlearn.evaluation.methods import Method, parse_method
 from lidarlearn.evaluation.plots import figures, write_plots
 from lidarlearn.evaluation.report import print_tables, report_tables, seen_in_training, write_report
-from lidarlearn.evaluation.run import Export, RunProgress, read_export, run_odometry
+from lidarlearn.evaluation.run import Export, read_export, run_odometry
 from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.submission import is_kitti_test_set, write_submission
 from lidarlearn.evaluation.trajectories import find_trajectories, lidar_poses, read_trajectory
 from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
+from lidarlearn.progress import progress
 
 _WITH_NETWORK = ("posenet", "posenet+p_f2m", "cv+p_f2m")
 _WITHOUT_NETWORK = ("cv+p_f2m", "cv+kd_f2m", "cv+vh_f2m")
@@ -114,30 +114,28 @@ def _own(
 ) -> Iterator[tuple[Score, Tensor]]:
     """Run every method on every sequence, unless the run folder holds that run, and score what they export."""
     data = OmegaConf.to_container(config.data, resolve=True)
-    with RunProgress() as progress:
-        for method in methods:
-            own = method_settings(config, method, networks)
-            own["code"] = code_digest(own, data)
-            for sequence in sequences.values():
-                export = Export(run_folder / "trajectories" / str(method), sequence.name)
-                settings = {"scans": sequence.fingerprint, **own}
-                found = export.settings()
-                if found != settings:
-                    if found is not None:
-                        progress.line(f"{method} on {sequence.name}: run anew, {differing_settings(found, settings)}")
-                    task = progress.start(str(method), sequence)
-                    advance = partial(progress.advance, task)
-                    run_odometry(
-                        build_odometry(config, method), sequence, export, config.data.deskew, advance, settings
-                    )
-                    progress.remove(task)
-                T_world_lidar, summary = read_export(export, sequence)
-                speed, health = summary["frames_per_second"], summary["health"]
-                progress.line(
-                    f"{method!s:<16} {sequence.name:<12} {len(sequence):>5} scans  {speed:6.1f} scans/s  "
-                    f"{health['flagged']} flagged{'  (found in the run folder)' if found == settings else ''}"
-                )
-                yield score(str(method), T_world_lidar, sequence, speed, health), T_world_lidar
+    for method in methods:
+        own = method_settings(config, method, networks)
+        own["code"] = code_digest(own, data)
+        for sequence in sequences.values():
+            what = f"{method} on {sequence.name}"
+            export = Export(run_folder / "trajectories" / str(method), sequence.name)
+            settings = {"scans": sequence.fingerprint, **own}
+            found = export.settings()
+            if found != settings:
+                if found is not None:
+                    print(f"{what}: run anew, {differing_settings(found, settings)}", flush=True)
+                odometry = build_odometry(config, method)
+                with progress(what, len(sequence)) as advance:
+                    run_odometry(odometry, sequence, export, config.data.deskew, advance, settings)
+            T_world_lidar, summary = read_export(export, sequence)
+            speed, health = summary["frames_per_second"], summary["health"]
+            print(
+                f"{method!s:<16} {sequence.name:<12} {len(sequence):>5} scans  {speed:6.1f} scans/s  "
+                f"{health['flagged']} flagged{'  (found in the run folder)' if found == settings else ''}",
+                flush=True,
+            )
+            yield score(str(method), T_world_lidar, sequence, speed, health), T_world_lidar
 
 
 def _foreign(config: DictConfig, sequences: Mapping[str, Sequence]) -> Iterator[tuple[Score, Tensor]]:

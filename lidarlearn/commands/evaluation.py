@@ -4,12 +4,10 @@ import argparse
 import json
 import sys
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from rich.progress import Progress
 
 from lidarlearn.commands import entry_point
 from lidarlearn.commands.compare import compare
@@ -22,6 +20,7 @@ from lidarlearn.evaluation.convergence import basin_figure, basin_tables, conver
 from lidarlearn.evaluation.maps import MapSettings
 from lidarlearn.evaluation.plots import write_plots
 from lidarlearn.evaluation.report import print_tables
+from lidarlearn.progress import progress
 
 _USAGE = """usage:
   python -m lidarlearn.evaluation compare RUN RUN ... [--output DIR]
@@ -74,13 +73,10 @@ def _measure_convergence(config: DictConfig, folder: Path) -> None:
     sequence, probe = sequences[0], instantiate(config.probe)
     write_run_description(folder, config)
     basins = {}
-    with Progress(transient=True) as progress:
-        for name in config.backends:
-            task = progress.add_task(f"{name} on {sequence.name}", total=len(sequence))
-            backend = instantiate(config.odometry[name])
-            advance = partial(progress.advance, task)
+    for name in config.backends:
+        backend = instantiate(config.odometry[name])
+        with progress(f"{name} on {sequence.name}", len(sequence)) as advance:
             basins[name] = convergence_basin(backend, sequence, probe, config.device, advance)
-            progress.remove_task(task)
     measured = json.dumps({name: asdict(basin) for name, basin in basins.items()}, indent=2)
     (folder / "convergence.json").write_text(measured + "\n", encoding="utf-8")
     print_tables(basin_tables(basins))

@@ -9,7 +9,6 @@ from typing import Any, cast
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from lidarlearn.data.progress import progress
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.map_figure import map_figure
@@ -18,6 +17,7 @@ from lidarlearn.evaluation.plots import write_plots
 from lidarlearn.evaluation.report import print_tables
 from lidarlearn.evaluation.run import Export, read_export
 from lidarlearn.evaluation.tables import Table
+from lidarlearn.progress import progress
 from lidarlearn.training.parts import require_trusted
 
 

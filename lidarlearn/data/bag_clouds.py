@@ -12,8 +12,8 @@ from lidarlearn.data.bag_files import Bag, Place, Topic
 from lidarlearn.data.cloud_files import returns_of
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.point_cloud2 import fields_of
-from lidarlearn.data.progress import tracked
 from lidarlearn.data.sweep_stamps import SweepClock, ascending, sweep_clock
+from lidarlearn.progress import tracked
 
 _log = logging.getLogger(__name__)
 

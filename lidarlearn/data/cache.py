@@ -21,11 +21,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from lidarlearn.data.locked import locked
-from lidarlearn.data.progress import tracked
 from lidarlearn.data.sequence import Sequence
 from lidarlearn.data.writable import writable
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.progress import tracked
 from lidarlearn.source_digest import source_digest
 
 QUANTUM_M = 0.004

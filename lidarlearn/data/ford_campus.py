@@ -34,10 +34,10 @@ from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import as_transforms, start_at_identity
-from lidarlearn.data.progress import tracked
 from lidarlearn.data.scan_files import ScanFiles, list_scans, subfolders, warn_of_gaps
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.progress import tracked
 
 _log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarlearn.data.progress import progress
+from lidarlearn.progress import progress
 from lidarlearn.simulation.drive import Drive
 
 

@@ -10,8 +10,6 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from lidarlearn.data.sequence import Sequence
@@ -119,46 +117,6 @@ def read_export(export: Export, sequence: Sequence) -> tuple[Float[Tensor, "n 4 
     frame = sequence.reference_frame
     summary = json.loads(export.summary.read_text(encoding="utf-8"))
     return to_lidar_frame(poses, frame, frame, sequence.T_reference_lidar), summary
-
-
-class RunProgress:
-    """A bar for each running method and sequence, and lines that stay."""
-
-    def __init__(self) -> None:
-        self._console = Console()
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("scans"),
-            TimeRemainingColumn(),
-            console=self._console,
-            transient=True,
-            disable=not self._console.is_terminal,
-        )
-
-    def __enter__(self) -> "RunProgress":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def start(self, method: str, sequence: Sequence) -> TaskID:
-        """Show a new bar."""
-        return self._progress.add_task(f"{method} on {sequence.name}", total=len(sequence))
-
-    def advance(self, task: TaskID) -> None:
-        """One scan more."""
-        self._progress.advance(task)
-
-    def remove(self, task: TaskID) -> None:
-        """Take a bar away."""
-        self._progress.remove_task(task)
-
-    def line(self, line: str) -> None:
-        """Print a line that stays."""
-        self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def summarize_health(records: Iterable[Health]) -> dict[str, float | int | None]:

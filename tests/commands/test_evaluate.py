@@ -42,6 +42,7 @@ def test_a_run_is_taken_up_where_it_was_left(call, no_plots, tmp_path):
     printed = call(run, "methods=[cv+p_f2m,ni]", "data.test_sequences=['0','1']")
     assert (tmp_path / "trajectories/cv+p_f2m/0.txt").stat().st_mtime_ns == before
     assert printed.count("found in the run folder") == 1
+    assert "ni on 1: 6 scans\n" in printed and "cv+p_f2m on 0: 6 scans\n" not in printed  # what a log says at once
     assert set(rows(tmp_path)) == {(m, s) for m in ("cv+p_f2m", "ni") for s in ("0", "1")}
 
 
@@ -215,7 +216,8 @@ def test_basins_of_convergence_are_measured_and_drawn(scans, tmp_path, monkeypat
     for basin in basins.values():
         assert basin["by_offset_m"]["0.1"] > 0.9 and basin["by_offset_m"]["20.0"] < 0.2
         assert basin["by_angle_deg"]["1.0"] > 0.9 and basin["by_angle_deg"]["170.0"] < 0.6
-    assert "Registrations that" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "kd_f2m on 0: 6 scans\n" in printed and "Registrations that" in printed
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data.kitti_raw import sweep_times
-from lidarlearn.data.progress import tracked
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.errors import UserError
+from lidarlearn.progress import tracked
 
 PERIOD_S = 0.1
 _SWEEP_TOLERANCE = 0.01  # of a revolution

@@ -1,4 +1,4 @@
-"""Progress of what takes minutes before the actual work begins: simulating, projecting, reading, writing."""
+"""Progress of what goes scan by scan and may take minutes: simulating, projecting, running an odometry, writing."""
 
 import sys
 import time
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from threading import Lock
 from typing import TypeVar
 
-from rich.progress import Progress
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 T = TypeVar("T")
 
@@ -26,7 +26,9 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
         total: number of scans.
     """
     if sys.stdout.isatty():
-        with Progress(transient=True) as bars:
+        description = TextColumn("{task.description}", markup=False)
+        columns = (description, BarColumn(), MofNCompleteColumn(), TextColumn("scans"), TimeRemainingColumn())
+        with Progress(*columns, transient=True) as bars:
             bar = bars.add_task(what, total=total)
             yield lambda: bars.advance(bar)
         return

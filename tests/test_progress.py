@@ -1,7 +1,7 @@
 """Progress into a file, where no bar moves."""
 
-from lidarlearn.data import progress as module
-from lidarlearn.data.progress import progress, tracked
+from lidarlearn import progress as module
+from lidarlearn.progress import progress, tracked
 
 
 def test_a_pipe_gets_a_line_at_once_and_then_now_and_again(capsys, monkeypatch):
