@@ -33,19 +33,40 @@ class EventLogger(TensorBoardLogger):
         self.experiment.flush()
 
 
-class InputImages(Callback):
+class _Drawing(Callback):
+    """Draws what a validation shows, now and then.
+
+    Args:
+        every_n_epochs: so many epochs lie between two drawings, or more where fewer are validated.
+    """
+
+    def __init__(self, every_n_epochs: int) -> None:
+        self.every_n_epochs = every_n_epochs
+        self._last_epoch: int | None = None
+
+    def begin(self, trainer: Trainer) -> SummaryWriter | None:
+        """TensorBoard's writer where a drawing is due, in the one process that has it, outside of sanity checks."""
+        writers = [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+        is_due = self._last_epoch is None or trainer.current_epoch - self._last_epoch >= self.every_n_epochs
+        if not is_due or trainer.sanity_checking or not trainer.is_global_zero or not writers:
+            return None
+        self._last_epoch = trainer.current_epoch
+        return writers[0]
+
+
+class InputImages(_Drawing):
     """Images of the first held-out pair: range and normals of its reference, and how well the target falls onto it.
 
     Normals are those that the loss uses, where it uses any.
 
     Args:
-        every_n_epochs: how often to draw them.
+        every_n_epochs: how often to draw them, where a validation allows it.
         max_range_m: range at the far end of the colour scale [m].
         max_residual_m: point-to-plane distance at the far end of its colour scale [m].
     """
 
     def __init__(self, every_n_epochs: int = 5, max_range_m: float = 60.0, max_residual_m: float = 1.0) -> None:
-        self.every_n_epochs = every_n_epochs
+        super().__init__(every_n_epochs)
         self.max_range_m = max_range_m
         self.max_residual_m = max_residual_m
 
@@ -59,8 +80,8 @@ class InputImages(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Draw the first pair of the first sequence."""
-        writer = _writer(trainer)
-        if writer is None or batch_idx or dataloader_idx or trainer.current_epoch % self.every_n_epochs:
+        writer = None if batch_idx or dataloader_idx else self.begin(trainer)
+        if writer is None:
             return
         assert isinstance(pl_module, PoseNetModule)
         reference, target = batch["reference"][:1], batch["target"][:1]
@@ -80,20 +101,20 @@ class InputImages(Callback):
             writer.add_image(f"val/{title}", enlarged(image), trainer.current_epoch)
 
 
-class Trajectories(Callback):
+class Trajectories(_Drawing):
     """Each held-out drive as predicted, over its ground truth, as a figure.
 
     Args:
-        every_n_epochs: how often to draw them.
+        every_n_epochs: how often to draw them, where a validation allows it.
     """
 
     def __init__(self, every_n_epochs: int = 1) -> None:
-        self.every_n_epochs = every_n_epochs
+        super().__init__(every_n_epochs)
 
-    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the drives of this validation."""
-        writer = _writer(trainer)
-        if writer is None or trainer.current_epoch % self.every_n_epochs:
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the drives of this validation, which the module has only just chained."""
+        writer = self.begin(trainer)
+        if writer is None:
             return
         assert isinstance(pl_module, PoseNetModule)
         for drive in pl_module.predicted_drives:
@@ -124,11 +145,3 @@ def enlarged(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 i j"]:
     """Every pixel repeated, a whole number of times."""
     times = max(1, _IMAGE_ROWS // image.shape[1])
     return image.repeat_interleave(times, dim=1).repeat_interleave(max(1, times // 2), dim=2)
-
-
-def _writer(trainer: Trainer) -> SummaryWriter | None:
-    """TensorBoard's writer in the one process that has it, outside of sanity checks."""
-    writers = [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
-    if trainer.sanity_checking or not trainer.is_global_zero or not writers:
-        return None
-    return writers[0]

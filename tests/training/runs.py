@@ -2,11 +2,18 @@
 
 from pathlib import Path
 
+import torch
 from hydra import compose, initialize_config_dir
+from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf, open_dict
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import Tensor
 
 from lidarlearn.commands.configs import config_directory
+from lidarlearn.data.cache import decode, encode
+from lidarlearn.data.sequence import Sequence
+from lidarlearn.geometry import se3
+from lidarlearn.training.module import PoseNetModule
 
 _QUICK = (
     "data=kitti_00-08",  # a group without a recipe of its own; replaced below
@@ -40,8 +47,15 @@ def curves(run_dir: Path) -> dict[str, list[tuple[int, float]]]:
     return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
 
 
-def image_tags(run_dir: Path) -> list[str]:
-    """Names of the images and figures of a run."""
+def images(run_dir: Path) -> dict[str, list[int]]:
+    """The epochs of which a run shows each of its images and figures, by name."""
     events = EventAccumulator(str(run_dir))
     events.Reload()
-    return events.Tags()["images"]
+    return {tag: [e.step for e in events.Images(tag)] for tag in events.Tags()["images"]}
+
+
+def predicted(checkpoint: Path, sequence: Sequence) -> Float[Tensor, "n 4 4"]:
+    """The poses of a drive as the network of a checkpoint predicts them."""
+    module = PoseNetModule.load_from_checkpoint(checkpoint)
+    maps = torch.stack([decode(encode(module.projection.vertex_map(scan.points))) for scan in sequence])
+    return se3.accumulate(module.relative_pose(maps[:-1], maps[1:]))

@@ -1,11 +1,16 @@
 """The images that TensorBoard shows."""
 
+import pytest
 import torch
+from matplotlib.figure import Figure
 
+from lidarlearn.commands.train import train
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.normals import normal_map
+from lidarlearn.training import callbacks
 from lidarlearn.training.callbacks import enlarged, normal_image, range_image, scalar_image
-from tests.box_world import SMALL, cast
+from tests.box_world import SMALL, BoxSequence, cast
+from tests.training.runs import configured, images, predicted
 
 
 def test_empty_pixels_are_black_and_others_are_not():
@@ -45,3 +50,29 @@ def test_enlarging_repeats_pixels():
     large = enlarged(image)
     assert large.shape == (3, 192, 24)
     torch.testing.assert_close(large[:, ::12, ::6], image)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
+def test_a_drive_is_drawn_as_the_network_predicts_it_after_that_epoch(tmp_path, monkeypatch):
+    drawn = {}
+
+    def figure(title, T_true, T_estimates):
+        drawn[title] = T_estimates["posenet"]
+        return Figure()
+
+    monkeypatch.setattr(callbacks, "trajectory_figure", figure)
+    often = ("trainer.max_epochs=2", "trainer.num_sanity_val_steps=-1")
+    train(configured(tmp_path, *often, frames=9), data_name="boxes")
+    first, last = drawn.pop("sequence 2 after 1 epochs"), drawn.pop("sequence 2 after 2 epochs")
+    expected = predicted(tmp_path / "checkpoints" / "last.ckpt", BoxSequence("2", 9))
+    torch.testing.assert_close(last, expected, rtol=1e-4, atol=1e-4)
+    assert not drawn and (first - last).abs().max() > 1e-2
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
+def test_images_are_drawn_as_often_as_validation_allows(tmp_path):
+    seldom = [f"callbacks.{name}.every_n_epochs=3" for name in ("images", "trajectories")]
+    often = ("trainer.max_epochs=6", "trainer.check_val_every_n_epoch=2", "+trainer.limit_train_batches=1")
+    train(configured(tmp_path, *seldom, *often, frames=5), data_name="boxes")
+    epochs = images(tmp_path)
+    assert len(epochs) == 4 and all(drawn == [1, 5] for drawn in epochs.values()), epochs

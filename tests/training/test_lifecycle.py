@@ -4,16 +4,14 @@ import pytest
 import torch
 
 from lidarlearn.commands.train import train
-from lidarlearn.data.cache import decode, encode
 from lidarlearn.errors import UserError
-from lidarlearn.geometry import se3
 from lidarlearn.metrics.relative import relative_errors
 from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.module import PoseNetModule
 from lidarlearn.training.supervised import SupervisedModule
 from lidarlearn.training.unsupervised import UnsupervisedModule
 from tests.box_world import SMALL, BoxDrives
-from tests.training.runs import configured, curves, image_tags
+from tests.training.runs import configured, curves, images, predicted
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
 EPOCHS, FRAMES = 3, 33  # two drives of 32 pairs: eight batches of eight an epoch
@@ -58,7 +56,7 @@ def test_the_curves_that_were_promised(run):
 
 
 def test_the_images_that_were_promised(run):
-    tags = " ".join(image_tags(run[0]))
+    tags = " ".join(images(run[0]))
     assert all(word in tags for word in ("vertex map", "normal map", "trajectory 2"))
 
 
@@ -77,8 +75,7 @@ def test_a_checkpoint_alone_gives_the_error_that_was_logged(run):
     module = PoseNetModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
     assert isinstance(module, SupervisedModule if loss == "supervised" else UnsupervisedModule)
     sequence = BoxDrives(frames=FRAMES).sequence("2")
-    maps = torch.stack([decode(encode(module.projection.vertex_map(scan.points))) for scan in sequence])
-    T = se3.accumulate(module.relative_pose(maps[:-1], maps[1:]))
+    T = predicted(folder / "checkpoints" / "last.ckpt", sequence)
     error = relative_errors(T, sequence.T_world_lidar).translation.mean()
     logged = curves(folder)["val/mean_relative_translation_error_m"][-1][1]
     assert float(error) == pytest.approx(logged, rel=1e-3)
