@@ -25,5 +25,6 @@ def quiet() -> None:
     """Hide hardware banners, tips and warnings about legitimate choices; whatever else is said stays."""
     for name in ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)  # who asks for a profile wants to read it
     for message in _NOT_FOR_THE_USER:
         warnings.filterwarnings("ignore", message=message)
