@@ -81,13 +81,17 @@ class ProgressLines(ProgressBar):
         self._show("  ".join(part for part in parts if part), in_place=False)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say which limit ended the training before its last epoch."""
+        """Say what ended the training before its last epoch."""
         within = "" if self._share >= 1 else " within an epoch"
         left = time_left_s(trainer)
         if left is not None and left <= 0:
             self._show(f"trainer.max_time is reached{within}", in_place=False)
         elif 0 < trainer.max_steps <= trainer.global_step:
             self._show(f"trainer.max_steps={trainer.max_steps} is reached{within}", in_place=False)
+        elif trainer.should_stop:  # else what they say is of an earlier training that this one goes on from
+            for callback in trainer.early_stopping_callbacks:
+                if callback.stopping_reason_message:
+                    self._show(f"EarlyStopping: {callback.stopping_reason_message}", in_place=False)
 
     def _head(self, trainer: Trainer) -> str:
         share = self._share
@@ -121,8 +125,8 @@ def _errors(metrics: dict[str, Tensor]) -> list[str]:
     """The validation errors that say most, with their units."""
     shown = {
         "val/avg_translation_error_percent": "avg translation error {:.2f} %",
-        "val/mean_relative_translation_error_percent": "relative translation error {:.1f} % of motion",
-        "val/mean_relative_translation_error_m": "= {:.3f} m",
+        "val/mean_relative_translation_error_m": "relative translation error {:.3f} m",
+        "val/mean_relative_translation_error_percent": "= {:.1f} % of motion",  # none where nothing moves
         "val/misfit": "misfit {:.3f}",
     }
     return [form.format(float(metrics[name])) for name, form in shown.items() if name in metrics]

@@ -239,6 +239,17 @@ def test_without_validation_the_last_checkpoint_is_what_there_is(tmp_path):
     assert train(config, data_name="boxes").name == "last.ckpt"
 
 
+def test_a_training_that_stops_early_says_why(tmp_path, capsys):
+    early = [
+        "+callbacks.early._target_=lightning.pytorch.callbacks.EarlyStopping", "+callbacks.early.monitor=val/error",
+        "+callbacks.early.stopping_threshold=1000",
+    ]  # fmt: skip
+    train(configured(tmp_path, *early, "trainer.max_epochs=2", frames=5), data_name="boxes")
+    out = capsys.readouterr().out
+    assert "epoch 2/2" not in out
+    assert "EarlyStopping: Stopping threshold reached: val/error" in out.splitlines()[-1]
+
+
 @pytest.mark.slow
 def test_a_part_of_the_validation_is_scored_as_far_as_it_goes(tmp_path):
     config = configured(

@@ -48,6 +48,18 @@ def test_in_a_log_file_one_line_an_epoch(trainer, capsys):
     assert "3.46 %" not in lines[1]  # not validated in this epoch
 
 
+def test_a_drive_that_stands_still_has_an_error_in_metres_alone(trainer, capsys):
+    del trainer.callback_metrics["val/avg_translation_error_percent"]
+    run(ProgressLines(seconds_between_lines=1000.0), trainer)
+    assert re.search(r" 100 %  loss 0\.125  relative translation error 0\.079 m  \d", capsys.readouterr().out)
+
+
+def test_a_drive_that_moves_has_it_as_a_share_of_the_motion_too(trainer, capsys):
+    trainer.callback_metrics["val/mean_relative_translation_error_percent"] = torch.tensor(5.43)
+    run(ProgressLines(seconds_between_lines=1000.0), trainer)
+    assert "  relative translation error 0.079 m  = 5.4 % of motion  " in capsys.readouterr().out
+
+
 def test_a_long_epoch_writes_lines_within(trainer, capsys):
     run(ProgressLines(seconds_between_lines=0.0), trainer)
     lines = capsys.readouterr().out.splitlines()
