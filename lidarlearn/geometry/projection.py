@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lidarlearn.geometry.ranges import squared_ranges
 
-_NOTHING = torch.iinfo(torch.int64).max  # its lower half is -1
+_NO_POINT = torch.iinfo(torch.int64).max  # its lower half is -1
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class SphericalProjection:
         return torch.where(inside, column.add_(row.int(), alpha=self.width), -1)
 
     def nearest_points(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch h w"]:
-        """Index into `points` of the nearest point of each pixel, -1 where no point fell; see `nearest_per_slot`."""
-        # One slot more, in front, for the points that fall into no pixel.
-        slots = self.pixel_index(points).add_(1)
-        index = nearest_per_slot(slots, squared_ranges(points.detach().float()), self.pixels + 1)[..., 1:].long()
+        """Index into `points` of the nearest point of each pixel, -1 where no point fell; see `nearest_per_bin`."""
+        # One bin more, in front, for the points that fall into no pixel.
+        bins = self.pixel_index(points).add_(1)
+        index = nearest_per_bin(bins, squared_ranges(points.detach().float()), self.pixels + 1)[..., 1:].long()
         return index.unflatten(-1, (self.height, self.width))
 
     def vertex_map(self, points: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3 h w"]:
@@ -73,24 +73,24 @@ class SphericalProjection:
         return filled.mT.unflatten(-1, (self.height, self.width))
 
 
-def nearest_per_slot(
-    slots: Int[Tensor, "*batch n"], ranges: Float[Tensor, "*batch n"], count: int
+def nearest_per_bin(
+    bins: Int[Tensor, "*batch n"], ranges: Float[Tensor, "*batch n"], count: int
 ) -> Int[Tensor, "*batch count"]:
-    """Index of the point with the smallest range among those of each slot, -1 where there are none; 32 bits.
+    """Index of the point with the smallest range among those of each bin, -1 where there are none; 32 bits.
 
     Deterministic on every device: the minimum of (range, index) packed into one integer wins, so equal ranges go to
     the smaller index, whatever the order of execution.
 
     Args:
-        slots: of each point, from 0 to `count` - 1.
+        bins: of each point, from 0 to `count` - 1.
         ranges: of each point, not negative; its square will do.
-        count: number of slots.
+        count: number of bins.
     """
     # non-negative floats are ordered like their bits
     keys = ranges.view(torch.int32).long().bitwise_left_shift_(32)
     keys += torch.arange(ranges.shape[-1], device=ranges.device)
-    nearest = torch.full((*ranges.shape[:-1], count), _NOTHING, device=ranges.device)
-    return nearest.scatter_reduce_(-1, slots.long(), keys, "amin").int()  # the lower half
+    nearest = torch.full((*ranges.shape[:-1], count), _NO_POINT, device=ranges.device)
+    return nearest.scatter_reduce_(-1, bins.long(), keys, "amin").int()  # the lower half
 
 
 def activated(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Bool[Tensor, "*batch h w"]:

@@ -48,7 +48,7 @@ def grid_sample(
     """
     if recordings is not None and cuda_graphs.are_used_on(points.device):
         return _recorded_grid_sample(points, voxel_size_m, recordings)
-    lots = _lots(len(points), points.device)
+    lots = _permutation(len(points), points.device)
     _, order, begins = _sorted(voxel_keys(voxel_cells(points, voxel_size_m)).index_select(0, lots))
     return lots[order[begins]]
 
@@ -69,7 +69,7 @@ def _sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> tuple[Int[Tens
 
     Cells are taken to lie within a million of the origin.
     """
-    lots = _lots(len(points), points.device)
+    lots = _permutation(len(points), points.device)
     x, y, z = ((axis.long() + (1 << 20)) & 0x1FFFFF for axis in voxel_cells(points, voxel_size_m).unbind(-1))
     nothing = torch.iinfo(torch.int64).max
     keys = torch.where(points[:, 0].isfinite(), (x << 42) | (y << 21) | z, nothing)
@@ -96,7 +96,7 @@ class VoxelSums:
         dtype: of the sums.
     """
 
-    _LEAST_WAITING = 1 << 20
+    _MIN_WAITING = 1 << 20
 
     def __init__(self, columns: int, dtype: torch.dtype = torch.float32) -> None:
         merged = (torch.zeros(0, 3, dtype=torch.int32), torch.zeros(0, columns, dtype=dtype))
@@ -106,7 +106,7 @@ class VoxelSums:
         """Count in points by the voxels that hold them."""
         self._parts.append(_summed(cells, values))
         merged, *waiting = (len(cells) for cells, _ in self._parts)
-        if sum(waiting) > max(self._LEAST_WAITING, merged):
+        if sum(waiting) > max(self._MIN_WAITING, merged):
             self.result()
 
     def result(self) -> tuple[Int[Tensor, "m 3"], Float[Tensor, "m c"]]:
@@ -125,7 +125,7 @@ def _summed(cells: Int[Tensor, "n 3"], values: Float[Tensor, "n c"]) -> tuple[In
     return once, values.new_zeros(len(keys), values.shape[1]).index_add_(0, voxel, values)
 
 
-def _lots(n: int, device: torch.device) -> Int[Tensor, "n"]:
+def _permutation(n: int, device: torch.device) -> Int[Tensor, "n"]:
     """The numbers from 0 to n - 1 in an order drawn once and for all."""
     lots = _shuffled(max(n - 1, 1).bit_length(), device)
     return lots if n == len(lots) else lots.index_select(0, (lots < n).nonzero()[:, 0])

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarlearn.geometry.se3 import MotionDifference
 from lidarlearn.odometry.health import Health, Status
-from lidarlearn.odometry.judgement import MotionDifference
 from lidarlearn.registration.result import RegistrationResult
 
 

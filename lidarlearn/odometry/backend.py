@@ -10,11 +10,10 @@ from torch import Tensor
 
 from lidarlearn.errors import require_positive
 from lidarlearn.geometry import se3
-from lidarlearn.geometry.voxels import voxel_cells
 from lidarlearn.odometry.deskew import deskew
 from lidarlearn.odometry.local_map import LocalMap
 from lidarlearn.odometry.sampling import SampledScan, Sampling
-from lidarlearn.registration.association.aggregated_points import AggregatedPoints
+from lidarlearn.registration.association.voxel_map import neighbourhood_normals
 from lidarlearn.registration.gauss_newton import GaussNewton
 from lidarlearn.registration.result import RegistrationResult
 
@@ -154,11 +153,3 @@ class Backend:
         if not self.registration.residual.needs_normals:
             return None
         return neighbourhood_normals(points, self.sampling.neighbourhood_m)[chosen]
-
-
-def neighbourhood_normals(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Float[Tensor, "n 3"]:
-    """Normals of a scan's points from the points in the voxels around each, zero where they span no plane."""
-    surface = AggregatedPoints(voxel_size_m, points.device)
-    surface.insert(points, frames=1)
-    index = surface.lookup(voxel_cells(points, voxel_size_m))
-    return torch.where((index >= 0)[:, None], surface.normals[index.clamp(min=0)], 0.0)

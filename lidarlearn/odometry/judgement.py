@@ -1,27 +1,10 @@
 """When a registration is doubted."""
 
-import math
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Float
-from torch import Tensor
-
 from lidarlearn.errors import require_positive
+from lidarlearn.geometry.se3 import MotionDifference
 from lidarlearn.registration.result import RegistrationResult
-
-
-@dataclass(frozen=True)
-class MotionDifference:
-    """How far two motions are apart.
-
-    Args:
-        distance_m: length of the translation between them [m].
-        angle_deg: angle of the rotation between them [deg].
-    """
-
-    distance_m: float
-    angle_deg: float
 
 
 @dataclass(frozen=True)
@@ -81,14 +64,3 @@ class Judgement:
 
     def _surprise(self, deviation: MotionDifference) -> float:
         return max(deviation.distance_m / self.max_deviation_m, deviation.angle_deg / self.max_deviation_deg)
-
-
-def motion_difference(T_a: Float[Tensor, "4 4"], T_b: Float[Tensor, "4 4"]) -> MotionDifference:
-    """The motion that remains between two motions.
-
-    In numpy, which takes a fraction of torch's time for one matrix: a GPU waits meanwhile.
-    """
-    T_a_b = np.linalg.solve(T_a.numpy(), T_b.numpy())
-    R, t = T_a_b[:3, :3], T_a_b[:3, 3]
-    twice_sine = np.linalg.norm(R - R.T) / math.sqrt(2)
-    return MotionDifference(float(np.linalg.norm(t)), math.degrees(math.atan2(twice_sine, np.trace(R) - 1)))

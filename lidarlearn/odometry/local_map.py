@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.odometry.judgement import motion_difference
+from lidarlearn.geometry import se3
 from lidarlearn.registration.association.base import Association
 
 
@@ -48,7 +48,7 @@ class LocalMap:
     def _is_key_frame(self, T_world_lidar: Float[Tensor, "4 4"]) -> bool:
         if self._T_world_key is None or self._key_frame_distance_m == self._key_frame_angle_deg == 0:
             return True
-        moved = motion_difference(self._T_world_key, T_world_lidar)
+        moved = se3.motion_difference(self._T_world_key, T_world_lidar)
         is_far = moved.distance_m >= self._key_frame_distance_m > 0
         is_turned = moved.angle_deg >= self._key_frame_angle_deg > 0
         return is_far or is_turned

@@ -15,7 +15,7 @@ from lidarlearn.odometry.backend import Backend
 from lidarlearn.odometry.health import Health, Status
 from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
 from lidarlearn.odometry.initialization.base import Initialization
-from lidarlearn.odometry.judgement import Judgement, motion_difference
+from lidarlearn.odometry.judgement import Judgement
 from lidarlearn.odometry.sampling import SampledScan
 from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, are_shares_of_a_period, as_scan
 
@@ -140,7 +140,7 @@ class Odometry(ScanByScan):
             scan, guess.T_previous_new, self._T_world_lidar, guess.error_m, self._motion_per_period
         )
         motion = se3.orthonormalize(torch.linalg.solve(self._T_world_lidar, result.T_world_lidar))
-        deviation = motion_difference(self._last_motion, motion)
+        deviation = se3.motion_difference(self._last_motion, motion)
         min_information = max(self._judgement.min_information, self._backend.registration.min_information)
         return Attempt(
             guess,
@@ -157,7 +157,7 @@ class Odometry(ScanByScan):
         if attempt.result.fit.item() < self._judgement.min_fit_share * max(self._fits, default=0.0):
             return True
         # Along a degenerate direction the guess remains.
-        guessed = motion_difference(self._last_motion, attempt.guess.T_previous_new)
+        guessed = se3.motion_difference(self._last_motion, attempt.guess.T_previous_new)
         return attempt.is_degenerate and not self._judgement.is_plausible(guessed)
 
     def _recover(self, scan: SampledScan, doubtful: Attempt) -> Attempt:
@@ -181,7 +181,7 @@ class Odometry(ScanByScan):
         motions, agreements = self._backend.register_hypotheses(scan, guesses, self._T_world_lidar, deskews)
         if self._is_starting:  # no last motion to compare with
             return motions[agreements.argmax()]
-        deviations = [motion_difference(self._last_motion, motion) for motion in motions]
+        deviations = [se3.motion_difference(self._last_motion, motion) for motion in motions]
         credibilities = map(self._judgement.credibility, agreements.tolist(), deviations)
         return motions[torch.tensor(list(credibilities)).argmax()]
 
@@ -200,7 +200,7 @@ class Odometry(ScanByScan):
         motion_per_period = self._motion_per_period(motion)
         self._move(motion)
         doubted, self._doubted_motion = self._doubted_motion, None
-        confirmed = doubted is not None and self._judgement.is_plausible(motion_difference(doubted, motion))
+        confirmed = doubted is not None and self._judgement.is_plausible(se3.motion_difference(doubted, motion))
         if not attempt.is_implausible or confirmed:
             self._last_motion = motion_per_period
         else:
@@ -244,5 +244,5 @@ class _FirstScan:
 
 def _guess_error_m(scan: SampledScan, T_guess: Tensor, T_previous_new: Tensor) -> float:
     """How far a point at the mean range was from where the guess had it."""
-    error = motion_difference(T_guess, T_previous_new)
+    error = se3.motion_difference(T_guess, T_previous_new)
     return error.distance_m + math.radians(error.angle_deg) * scan.mean_range_m

@@ -26,7 +26,7 @@ class Frame:
     health: Health
 
 
-_LATEST = 1.5  # scan periods from the instant of a pose
+_MAX_TIME = 1.5  # of a point, in scan periods before or after the instant of the pose
 
 # Of any number type, on any device, arrays in any order of memory; `as_scan` checks them, for they come from users.
 Points = Tensor | np.ndarray
@@ -76,7 +76,7 @@ def as_scan(
 
 def are_shares_of_a_period(times: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
     """Which times can be those of points of one scan, whatever instant of it the pose is that of."""
-    return times.abs() <= _LATEST
+    return times.abs() <= _MAX_TIME
 
 
 def _as_tensor(values: Tensor | np.ndarray, device: torch.device | None) -> Tensor:

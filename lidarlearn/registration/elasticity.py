@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lidarlearn.registration.normal_equations import NormalEquations
 
-_LEAST_VARIANCE = 1e-6  # of residuals [m^2]
+_MIN_VARIANCE_M2 = 1e-6  # of the residuals
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class Elasticity:
             rigid: those of the pose alone.
             phases: when each point was measured, as a share of the scan period.
         """
-        across, within = rigid.terms.moments(phases)
+        across, within = rigid.terms.phase_moments(phases)
         variance = rigid.squares / np.maximum(np.trace(rigid.H[..., :3, :3], axis1=-2, axis2=-1), 1e-12)
         expected = np.repeat([self.translation_m, math.radians(self.rotation_deg)], 3) ** 2
-        held = self.points_per_measurement * (variance + _LEAST_VARIANCE)[..., None] / expected
+        held = self.points_per_measurement * (variance + _MIN_VARIANCE_M2)[..., None] / expected
         H_skew = within[..., :6, :6] + held[..., None] * np.eye(6)
         gain = np.linalg.solve(H_skew, across[..., :6, :])  # of the skew by the pose's six unknowns, and by itself
         return ElasticEquations(

@@ -15,13 +15,13 @@ from lidarlearn.geometry import se3
 from lidarlearn.registration.association.base import Association
 from lidarlearn.registration.elasticity import Elasticity
 from lidarlearn.registration.matching import Matching, Queries
-from lidarlearn.registration.normal_equations import NormalEquations, Position, Terms, position_of
+from lidarlearn.registration.normal_equations import NormalEquations, Terms
 from lidarlearn.registration.residuals import PointToPlane, Residual
 from lidarlearn.registration.result import RegistrationResult
-from lidarlearn.registration.steps import lengths, motion
+from lidarlearn.registration.steps import retraction, step_sizes
 from lidarlearn.registration.weights import GemanMcClure, RobustWeight
 
-_FEW = 0.1  # share of the points below which neighbours are too few for what they say to be believed
+_MIN_MATCHED_SHARE = 0.1  # of the points, below which a good fit is likely to be chance
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class GaussNewton:
         return self.translation_tolerance_m, math.radians(self.rotation_tolerance_deg)
 
     @property
-    def _longest(self) -> tuple[float, float]:
+    def _max_step(self) -> tuple[float, float]:
         return self.max_step_m, math.radians(self.max_step_deg)
 
     def register(
@@ -110,28 +110,27 @@ class GaussNewton:
         # Where functions are recorded, another number of points would take another recording, and no less time.
         is_recorded = matching.recordings(queries) is not None
         coarse = queries if is_recorded else queries.every(self.coarse_stride)
-        iterations, found = 0, None
+        iterations, neighbours = 0, None
         for distance_m in self._distances_m(search_distance_m):
             iterations += 1
             is_final_distance, T_linearized = distance_m == self.search_distance_m, T
-            equations = matching.equations(queries if is_final_distance else coarse, T, distance_m, found)
-            position, found = position_of(equations), equations.terms.found
-            step = np.where(converged[..., None], 0.0, self._step(equations, position))
-            T = T @ motion(step)
+            equations = matching.equations(queries if is_final_distance else coarse, T, distance_m, neighbours)
+            neighbours = equations.terms.neighbours
+            step = np.where(converged[..., None], 0.0, self._step(equations))
+            T = T @ retraction(step)
             if is_final_distance:
-                is_small = (lengths(step) < self._tolerances).all(-1)
+                is_small = (step_sizes(step) < self._tolerances).all(-1)
                 converged = np.asarray(converged | (is_small & (equations.H != 0).any((-2, -1))))
             if converged.all():  # the last equations describe the result, but for a small step
                 break
         else:
-            T_linearized, equations = T, matching.equations(queries, T, self.search_distance_m, found)
-            position = position_of(equations)
+            T_linearized, equations = T, matching.equations(queries, T, self.search_distance_m, neighbours)
         skew = np.zeros((*T.shape[:-2], 6))
         if phases is not None and self.elasticity is not None:
             elastic = self.elasticity.equations(equations, phases)
-            step = self._step(elastic.pose, position_of(elastic.pose))
-            T, skew = T_linearized @ motion(step), elastic.skew(step)
-        return self._judge(T, skew, iterations, converged, equations, position)
+            step = self._step(elastic.pose)
+            T, skew = T_linearized @ retraction(step), elastic.skew(step)
+        return self._judge(T, skew, iterations, converged, equations)
 
     def agreement(
         self,
@@ -156,7 +155,7 @@ class GaussNewton:
         matching, T = self._matching(association), T_world_lidar.cpu().numpy()
         terms = matching.equations(Queries(points, normals), T, search_distance_m).terms
         fit, neighbours = self._fits(terms).sum(-1), terms.mask.sum(-1)
-        return (fit / (neighbours + _FEW * max(len(points), 1))).cpu()
+        return (fit / (neighbours + _MIN_MATCHED_SHARE * max(len(points), 1))).cpu()
 
     def _distances_m(self, first_m: float) -> Iterator[float]:
         """The search distance of each iteration [m]: narrowing from the first to `search_distance_m`."""
@@ -167,13 +166,14 @@ class GaussNewton:
     def _matching(self, association: Association) -> Matching:
         return Matching(self.residual, self.weight, self.search_distance_m, association)
 
-    def _step(self, equations: NormalEquations, position: Position) -> Float64[np.ndarray, "*batch 6"]:
+    def _step(self, equations: NormalEquations) -> Float64[np.ndarray, "*batch 6"]:
         """The minimum of the linearized energy, on condition that the position stays where nothing is known of it."""
-        step = -(position.covariance @ equations.g[..., None])
-        unknown = (position.information < self.min_information)[..., None]
-        along = position.directions.swapaxes(-1, -2) @ step[..., :3, :]
-        step = (step - position.responses @ (unknown * along))[..., 0]
-        excess = lengths(step) / self._longest
+        known = equations.localizability
+        step = -(known.covariance @ equations.g[..., None])
+        unknown = (known.information < self.min_information)[..., None]
+        along = known.directions.swapaxes(-1, -2) @ step[..., :3, :]
+        step = (step - known.pose_directions @ (unknown * along))[..., 0]
+        excess = step_sizes(step) / self._max_step
         return step / np.maximum(excess.max(-1, keepdims=True), 1.0)
 
     def _judge(
@@ -183,15 +183,15 @@ class GaussNewton:
         iterations: int,
         converged: Bool[np.ndarray, "*batch"],
         equations: NormalEquations,
-        position: Position,
     ) -> RegistrationResult:
         terms = equations.terms
         count = functools.partial(self._counts, terms)
         counts = terms.recordings(count, device=terms.mask.device, settings=self, reads_first=True)
         neighbours, inliers, fit, weight = counts.numpy()
         points = max(equations.points, 1)
-        order = position.information.argsort(axis=-1)
-        weakest = np.take_along_axis(position.directions, order[..., None, :], axis=-1)[..., 0]
+        directions, information = equations.localizability.directions, equations.localizability.information
+        order = information.argsort(axis=-1)
+        weakest = np.take_along_axis(directions, order[..., None, :], axis=-1)[..., 0]
         return RegistrationResult(
             T_world_lidar=se3.orthonormalize(torch.from_numpy(T)),
             skew=torch.from_numpy(skew),
@@ -202,16 +202,16 @@ class GaussNewton:
             fit=torch.as_tensor(fit / points),
             rmse_m=torch.as_tensor(np.sqrt(equations.squares / np.maximum(weight, 1e-12))),
             hessian=torch.from_numpy(equations.H),
-            information=torch.from_numpy(np.take_along_axis(position.information, order, axis=-1)),
+            information=torch.from_numpy(np.take_along_axis(information, order, axis=-1)),
             weakest_direction=torch.from_numpy(weakest),
         )
 
     def _counts(self, terms: Terms) -> Float[Tensor, "4 *batch"]:
         """Number of points with a neighbour, of those that fit, how well all fit, and the weights; summed up."""
         neighbour = terms.mask.double()
-        inlier = neighbour * (terms.off_m < self.inlier_residual_m)
+        inlier = neighbour * (terms.surface_distances_m < self.inlier_residual_m)
         return torch.stack([neighbour, inlier, self._fits(terms), terms.weights]).sum(-1)
 
     def _fits(self, terms: Terms) -> Float[Tensor, "*batch m"]:
         """How well each point fits the map's surface, 0..1, 0 without a neighbour."""
-        return terms.mask * torch.exp(-((terms.off_m / self.fit_residual_m) ** 2))
+        return terms.mask * torch.exp(-((terms.surface_distances_m / self.fit_residual_m) ** 2))

@@ -11,13 +11,13 @@ from torch import Tensor
 from lidarlearn import cuda_graphs
 from lidarlearn.geometry import se3
 from lidarlearn.registration.association.base import Association, Neighbours
-from lidarlearn.registration.normal_equations import NormalEquations, Terms, normal_equations, weighted_sums
+from lidarlearn.registration.normal_equations import NormalEquations, Terms, augmented_hessian
 from lidarlearn.registration.residuals import Residual
 from lidarlearn.registration.weights import RobustWeight
 
 _PADDING = cuda_graphs.Padding(value=1e6)  # with points [m] that are near to nothing
 
-_SumsAndTerms = tuple[Float64[Tensor, "*batch 7 7"], Terms]
+_HessianAndTerms = tuple[Float64[Tensor, "*batch 7 7"], Terms]
 
 
 @dataclass(frozen=True)
@@ -71,10 +71,10 @@ class Matching:
         points, recordings = queries.points, self.recordings(queries)
         if recordings is None:
             T = torch.from_numpy(T_world_lidar).to(points)
-            sums, terms = self._terms(points, T, distance_m, distance_m, queries.normals, last)
-            return normal_equations(sums.cpu(), terms, len(points))
+            hessian, terms = self._terms(points, T, distance_m, distance_m, queries.normals, last)
+            return NormalEquations.of(hessian.cpu(), terms, len(points))
         reach_m = self.association.reach_m(distance_m)
-        sums, terms = recordings(
+        hessian, terms = recordings(
             functools.partial(self._recorded_terms, shape=T_world_lidar.shape, reach_m=reach_m),
             points,
             torch.from_numpy(np.append(T_world_lidar, distance_m)),  # sent at once
@@ -84,7 +84,7 @@ class Matching:
             keeps_first=True,
             reads_first=True,
         )
-        return normal_equations(sums, terms, len(points))
+        return NormalEquations.of(hessian, terms, len(points))
 
     def recordings(self, queries: Queries) -> cuda_graphs.Recordings | None:
         """Where this is recorded, if it is: not for generalized ICP, which inverts matrices."""
@@ -93,7 +93,7 @@ class Matching:
 
     def _recorded_terms(
         self, points: Float[Tensor, "n 3"], numbers: Float[Tensor, "_"], shape: tuple[int, ...], reach_m: float
-    ) -> _SumsAndTerms:
+    ) -> _HessianAndTerms:
         numbers = numbers.to(points)
         return self._terms(points, numbers[:-1].view(shape), numbers[-1], reach_m)
 
@@ -105,27 +105,27 @@ class Matching:
         reach_m: float,
         normals: Float[Tensor, "n 3"] | None = None,
         last: Neighbours | None = None,
-    ) -> _SumsAndTerms:
+    ) -> _HessianAndTerms:
         """Neighbours are searched within `reach_m` and count within `distance_m`."""
         points_world = se3.transform(T, points)
         found = self.association.search(points_world.reshape(-1, 3), reach_m, last)
         map_points = found.points.view_as(points_world)
         map_normals = found.normals.view_as(points_world)
         mask = (found.mask & (found.normals != 0).any(dim=-1)).view(points_world.shape[:-1])
-        linear = self.residual.linearize(T, points, points_world, map_points, map_normals, normals)
-        offsets = points_world - map_points
-        is_distance = linear.residuals.shape[-1] == 1
-        size = linear.residuals[..., 0].abs() if is_distance else linear.residuals.norm(dim=-1)
+        augmented_jacobians = self.residual.linearize(T, points, points_world, map_points, map_normals, normals)
+        residuals, offsets = augmented_jacobians[..., 6], points_world - map_points
+        is_distance = residuals.shape[-1] == 1
+        size = residuals[..., 0].abs() if is_distance else residuals.norm(dim=-1)
         widening = distance_m / self.search_distance_m  # a narrow kernel would hold on to whatever is near by chance
         squared_distances = offsets.square().sum(-1)
         if isinstance(distance_m, Tensor):
             mask = mask & (squared_distances <= distance_m**2)
         weights = self.weight.weight(size / widening, squared_distances / widening**2) * mask
-        return weighted_sums(linear.rows.double(), weights), Terms(
-            found=found.neighbours,
+        return augmented_hessian(augmented_jacobians.double(), weights), Terms(
+            neighbours=found.neighbours,
             mask=mask,
             # Whatever is minimized, a pose is judged by how far points are off the map's surface, not along it.
-            off_m=size if is_distance else (offsets * map_normals).sum(-1).abs(),
+            surface_distances_m=size if is_distance else (offsets * map_normals).sum(-1).abs(),
             weights=weights,
-            rows=linear.rows,
+            augmented_jacobians=augmented_jacobians,
         )

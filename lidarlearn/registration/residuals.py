@@ -15,27 +15,6 @@ from lidarlearn.errors import require_positive
 from lidarlearn.geometry import se3
 
 
-@dataclass(frozen=True)
-class Linearization:
-    """Residuals of n correspondences, k each, and their Jacobians.
-
-    Args:
-        rows: dr/dxi and r [m] side by side: H and g of the normal equations are parts of one product.
-    """
-
-    rows: Float[Tensor, "*batch n k 7"]
-
-    @property
-    def residuals(self) -> Float[Tensor, "*batch n k"]:
-        """Residuals r [m]."""
-        return self.rows[..., 6]
-
-    @property
-    def jacobians(self) -> Float[Tensor, "*batch n k 6"]:
-        """Derivatives dr/dxi."""
-        return self.rows[..., :6]
-
-
 class Residual(ABC):
     """What a registration minimizes the weighted squares of."""
 
@@ -50,8 +29,8 @@ class Residual(ABC):
         map_points: Float[Tensor, "*batch n 3"],
         map_normals: Float[Tensor, "*batch n 3"],
         normals: Float[Tensor, "n 3"] | None = None,
-    ) -> Linearization:
-        """Residuals and Jacobians at a pose.
+    ) -> Float[Tensor, "*batch n k 7"]:
+        """Residuals and their Jacobians at a pose, k of each for every correspondence.
 
         Args:
             T_world_lidar: pose of the new scan.
@@ -60,6 +39,9 @@ class Residual(ABC):
             map_points: the points they are associated with.
             map_normals: unit normals there, zero where undefined.
             normals: unit normals of the new scan, in its own frame; used by generalized ICP.
+
+        Returns:
+            The augmented Jacobian [J r]: derivatives by the motion, then the residual [m].
         """
 
 
@@ -77,12 +59,12 @@ class PointToPlane(Residual):
         map_points: Tensor,
         map_normals: Tensor,
         normals: Tensor | None = None,
-    ) -> Linearization:
+    ) -> Tensor:
         """One residual per correspondence; zero where the map has no normal."""
         normals_lidar = map_normals @ T_world_lidar[..., :3, :3].to(points)  # R^T n, row by row
         r = ((points_world - map_points) * map_normals).sum(-1, keepdim=True)
         lever = torch.linalg.cross(points.expand_as(normals_lidar), normals_lidar)
-        return Linearization(torch.cat([normals_lidar, lever, r], dim=-1)[..., None, :])
+        return torch.cat([normals_lidar, lever, r], dim=-1)[..., None, :]
 
 
 class PointToPoint(Residual):
@@ -96,9 +78,9 @@ class PointToPoint(Residual):
         map_points: Tensor,
         map_normals: Tensor,
         normals: Tensor | None = None,
-    ) -> Linearization:
+    ) -> Tensor:
         """Three residuals per correspondence."""
-        return Linearization(_point_rows(T_world_lidar, points, points_world - map_points))
+        return _point_jacobians(T_world_lidar, points, points_world - map_points)
 
 
 @dataclass(frozen=True)
@@ -128,7 +110,7 @@ class GeneralizedIcp(Residual):
         map_points: Tensor,
         map_normals: Tensor,
         normals: Tensor | None = None,
-    ) -> Linearization:
+    ) -> Tensor:
         """Three residuals per correspondence."""
         if normals is None:
             raise ValueError("generalized ICP needs the normals of the new scan")
@@ -137,14 +119,14 @@ class GeneralizedIcp(Residual):
         own = torch.where((own != 0).any(-1, keepdim=True), own, map_normals)  # unknown: the surface it is matched with
         covariance = self._disc(map_normals) + self._disc(own)
         whitening = torch.linalg.cholesky(torch.linalg.inv(covariance)).mT * (2 * self.epsilon) ** 0.5
-        return Linearization(whitening @ _point_rows(T_world_lidar, points, points_world - map_points))
+        return whitening @ _point_jacobians(T_world_lidar, points, points_world - map_points)
 
     def _disc(self, normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
         eye = torch.eye(3, dtype=normals.dtype, device=normals.device)
         return eye - (1 - self.epsilon) * normals[..., :, None] * normals[..., None, :]
 
 
-def _point_rows(
+def _point_jacobians(
     T_world_lidar: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "n 3"], offsets: Float[Tensor, "*batch n 3"]
 ) -> Float[Tensor, "*batch n 3 7"]:
     """d(T exp(xi) p)/dxi = [R, -R hat(p)], and the offsets beside it."""

@@ -169,3 +169,11 @@ def test_vertex_maps_are_transformed_point_by_point(batch):
     T = se3.exp(random_twists(*batch))
     maps = torch.randn(*batch, 3, 4, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert_close(se3.transform_map(T, maps).flatten(-2), se3.transform(T, maps.flatten(-2).mT).mT)
+
+
+def test_the_difference_of_motions_is_the_motion_between_them():
+    T_a = se3.exp(torch.tensor([1.2, 0.1, 0.0, 0.01, -0.02, 0.3], dtype=torch.float64))
+    T_a_b = se3.exp(torch.tensor([0.3, 0.0, 0.4, 0.0, 0.0, math.radians(5)], dtype=torch.float64))
+    difference = se3.motion_difference(T_a, T_a @ T_a_b)
+    assert difference.distance_m == pytest.approx(T_a_b[:3, 3].norm().item())
+    assert difference.angle_deg == pytest.approx(5.0)

@@ -69,7 +69,7 @@ def test_sums_over_parts_are_those_over_everything():
 
 
 def test_the_memory_of_sums_goes_by_the_voxels(monkeypatch):
-    monkeypatch.setattr(VoxelSums, "_LEAST_WAITING", 0)
+    monkeypatch.setattr(VoxelSums, "_MIN_WAITING", 0)
     points = random_points(3000, 3.0)
     cells, sums = voxel_cells(points, 0.5), VoxelSums(1)
     occupied = len(cells.unique(dim=0))

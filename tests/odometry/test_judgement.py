@@ -1,10 +1,7 @@
-import math
-
 import pytest
-import torch
 
-from lidarlearn.geometry import se3
-from lidarlearn.odometry.judgement import Judgement, MotionDifference, motion_difference
+from lidarlearn.geometry.se3 import MotionDifference
+from lidarlearn.odometry.judgement import Judgement
 
 JUDGEMENT = Judgement(max_deviation_m=0.5, max_deviation_deg=8.0, min_gain=0.1)
 
@@ -33,11 +30,3 @@ def test_a_change_of_motion_must_agree_better_in_proportion_and_by_no_more_than_
 def test_changes_of_motion_that_are_plausible_have_a_size(setting):
     with pytest.raises(ValueError, match=f"must be above 0.*{setting}=0"):
         Judgement(**{setting: 0.0})
-
-
-def test_the_difference_of_motions_is_the_motion_between_them():
-    T_a = se3.exp(torch.tensor([1.2, 0.1, 0.0, 0.01, -0.02, 0.3], dtype=torch.float64))
-    T_a_b = se3.exp(torch.tensor([0.3, 0.0, 0.4, 0.0, 0.0, math.radians(5)], dtype=torch.float64))
-    difference = motion_difference(T_a, T_a @ T_a_b)
-    assert difference.distance_m == pytest.approx(T_a_b[:3, 3].norm().item())
-    assert difference.angle_deg == pytest.approx(5.0)

@@ -8,7 +8,7 @@ from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.models.posenet import PoseNet
 from lidarlearn.odometry.initialization.posenet import PoseNetInitialization
 from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
-from lidarlearn.registration.association import sliding_window
+from lidarlearn.registration.association import point_buffer
 from lidarlearn.training.trained_network import TrainedNetwork
 from tests import pretended_graphs
 from tests.gpu import on_gpu
@@ -29,7 +29,7 @@ def test_a_recorded_drive_is_the_same(association, map_, monkeypatch):
     drive = scans_of(street(yaw_step=0.03))
     here = run(built(f"{association}_{map_}"), drive)
     made = pretended_graphs.pretend(monkeypatch)
-    monkeypatch.setattr(sliding_window, "_CAPACITY_ON_GPU", 1 << 14)
+    monkeypatch.setattr(point_buffer, "_INITIAL_CAPACITY_ON_GPU", 1 << 14)
     there = run(built(f"{association}_{map_}"), drive)
     translations, angles = motion_errors(poses(there), poses(here))
     assert translations.max() < 5e-4 and angles.max() < 5e-3  # less than a step that ends a registration

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.odometry.backend import neighbourhood_normals
 from lidarlearn.odometry.sampling import GridSampling, ImageSampling, Sampling
 from lidarlearn.registration.association import KdTree, Projective, VoxelHash
 from lidarlearn.registration.association.base import Association
+from lidarlearn.registration.association.voxel_map import neighbourhood_normals
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import hdl64

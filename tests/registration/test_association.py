@@ -39,9 +39,9 @@ def test_following_saves_looking_up(association, monkeypatch):
     asked = []
     nearest = type(scene.association).nearest
 
-    def counted(self: Association, points_world: Tensor, places: Tensor, max_distance_m: float):
+    def counted(self: Association, points_world: Tensor, bins: Tensor, max_distance_m: float):
         asked.append(len(points_world))
-        return nearest(self, points_world, places, max_distance_m)
+        return nearest(self, points_world, bins, max_distance_m)
 
     monkeypatch.setattr(type(scene.association), "nearest", counted)
     queries = se3.transform(scene.T_world_lidar, scene.queries)

@@ -86,7 +86,8 @@ def test_agrees_with_all_twelve_unknowns_at_once(residual, batch):
     step = -np.linalg.solve(elastic.pose.H, elastic.pose.g[..., None])[..., 0]
     found = np.concatenate([step, elastic.skew(step)], axis=-1)
 
-    rows = rigid.terms.rows.double().reshape(-1, *rigid.terms.rows.shape[-3:])[0]
+    rows = rigid.terms.augmented_jacobians
+    rows = rows.double().reshape(-1, *rows.shape[-3:])[0]
     weights = rigid.terms.weights.double().reshape(-1, len(rows))[0]
     J, r = rows[..., :6], rows[..., 6]
     both = torch.cat([J, J * phases.double()[:, None, None]], dim=-1) * weights.sqrt()[:, None, None]

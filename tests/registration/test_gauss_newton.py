@@ -180,7 +180,7 @@ class _Plane(Association):
 
     points = normals = torch.zeros(0, 3)
 
-    def nearest(self, points_world: Tensor, places: Tensor, max_distance_m: float) -> Neighbours:
+    def nearest(self, points_world: Tensor, bins: Tensor, max_distance_m: float) -> Neighbours:
         raise AssertionError("no points to look up")
 
     def search(self, points_world: Tensor, max_distance_m: float, last: Neighbours | None = None) -> Correspondences:

@@ -116,7 +116,7 @@ def test_an_image_lasts_until_the_sensor_is_elsewhere_or_tilted(scans, xi, begin
         association.insert(scans[0], T, frames=2)
     ahead = torch.tensor([[10.0, 0.0, -1.0]])
     seen_from = T_world_lidar if begins else se3.identity()
-    assert torch.equal(association.places(se3.transform(seen_from, ahead)), SMALL.pixel_index(ahead))
+    assert torch.equal(association.bins(se3.transform(seen_from, ahead)), SMALL.pixel_index(ahead))
 
 
 def test_out_of_view_is_not_associated(scans):

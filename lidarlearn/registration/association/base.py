@@ -17,13 +17,13 @@ class Neighbours:
 
     Args:
         queries: where each query was when its neighbour was looked up [m].
-        places: which part of the map was looked at, see `Association.places`.
+        bins: which part of the map was looked at, see `Association.bins`.
         index: the nearest point of that part, -1 where there is none.
         others_m: all its other points were at least this far from the query [m].
     """
 
     queries: Float[Tensor, "n 3"]
-    places: Int[Tensor, "n"]
+    bins: Int[Tensor, "n"]
     index: Int[Tensor, "n"]
     others_m: Float[Tensor, "n"]
 
@@ -31,7 +31,7 @@ class Neighbours:
         """A copy with some of them exchanged."""
         return Neighbours(
             self.queries.index_copy(0, which, by.queries),
-            self.places.index_copy(0, which, by.places),
+            self.bins.index_copy(0, which, by.bins),
             self.index.index_copy(0, which, by.index),
             self.others_m.index_copy(0, which, by.others_m),
         )
@@ -124,32 +124,30 @@ class Association(ABC):
         if self.is_empty:
             nothing = torch.zeros_like(points_world)
             return Correspondences(nothing, nothing, torch.zeros_like(points_world[:, 0], dtype=torch.bool))
-        places = self.places(points_world)
+        bins = self.bins(points_world)
         is_recorded = self.recordings is not None and cuda_graphs.are_used_on(points_world.device)
         if last is None or len(last.index) != len(points_world) or is_recorded:
-            neighbours = self.nearest(points_world, places, max_distance_m)
+            neighbours = self.nearest(points_world, bins, max_distance_m)
         else:
-            neighbours = self._followed(points_world, places, max_distance_m, last)
+            neighbours = self._followed(points_world, bins, max_distance_m, last)
         index = neighbours.index.clamp(min=0)
         points = self.points_at(index)
         within = (points - points_world).square().sum(dim=1) <= max_distance_m**2
         return Correspondences(points, self.normals_at(index), within & (neighbours.index >= 0), neighbours)
 
-    def places(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    def bins(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
         """In which part of the map each point looks for its neighbour: everywhere, if not defined otherwise."""
         return torch.zeros(len(points_world), dtype=torch.int64, device=points_world.device)
 
     @abstractmethod
-    def nearest(
-        self, points_world: Float[Tensor, "n 3"], places: Int[Tensor, "n"], max_distance_m: float
-    ) -> Neighbours:
+    def nearest(self, points_world: Float[Tensor, "n 3"], bins: Int[Tensor, "n"], max_distance_m: float) -> Neighbours:
         """Look up the nearest point of each point's place; farther ones than `max_distance_m` need not be found."""
 
-    def _followed(self, points_world: Tensor, places: Tensor, max_distance_m: float, last: Neighbours) -> Neighbours:
+    def _followed(self, points_world: Tensor, bins: Tensor, max_distance_m: float, last: Neighbours) -> Neighbours:
         """Look up only what may have changed."""
         moved = (points_world - last.queries).norm(dim=1)
         distances = (self.points_at(last.index.clamp(min=0)) - points_world).norm(dim=1)
         distances = torch.where(last.index < 0, max_distance_m, distances.clamp(max=max_distance_m))
-        stale = (distances > last.others_m - moved) | (places != last.places)
+        stale = (distances > last.others_m - moved) | (bins != last.bins)
         which = stale.nonzero()[:, 0]
-        return last.replaced(which, self.nearest(points_world[which], places[which], max_distance_m))
+        return last.replaced(which, self.nearest(points_world[which], bins[which], max_distance_m))

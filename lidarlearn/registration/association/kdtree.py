@@ -6,15 +6,17 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lidarlearn.registration.association.aggregated_map import AggregatedMap
 from lidarlearn.registration.association.base import Neighbours
+from lidarlearn.registration.association.voxel_map_association import VoxelMapAssociation
 
-_MARGIN_M = 0.1  # searched beyond: a point that finds nothing need not look again until it moved so far
-_FEW = 1000  # queries that one thread has answered before others have started
+_SEARCH_MARGIN_M = (
+    0.1  # beyond the search distance: points without a neighbour are searched again once they moved this far
+)
+_MIN_PARALLEL_QUERIES = 1000  # fewer are answered before a second thread has started
 _LEAF_SIZE = 32  # points; smaller leaves take longer to build, and no less to search
 
 
-class KdTree(AggregatedMap):
+class KdTree(VoxelMapAssociation):
     """The nearest point of the aggregated map by a KdTree (scipy's), rebuilt once per inserted scan.
 
     The tree is built and searched on the CPU, wherever the map is.
@@ -32,24 +34,22 @@ class KdTree(AggregatedMap):
         super().insert(points, T_world_lidar, frames)
         self._tree = None
 
-    def nearest(
-        self, points_world: Float[Tensor, "n 3"], places: Int[Tensor, "n"], max_distance_m: float
-    ) -> Neighbours:
+    def nearest(self, points_world: Float[Tensor, "n 3"], bins: Int[Tensor, "n"], max_distance_m: float) -> Neighbours:
         """The exact nearest neighbour within `max_distance_m`."""
         if self._tree is None:
             # A sliding-midpoint tree is built four times faster than a balanced one and searched as fast.
             points = self.points.cpu().contiguous().numpy()
             self._tree = cKDTree(points, leafsize=_LEAF_SIZE, balanced_tree=False, compact_nodes=False)
         queries = points_world.cpu().numpy()
-        workers = 1 if len(queries) < _FEW else torch.get_num_threads()
-        reach_m = max_distance_m + _MARGIN_M
+        workers = 1 if len(queries) < _MIN_PARALLEL_QUERIES else torch.get_num_threads()
+        reach_m = max_distance_m + _SEARCH_MARGIN_M
         found = self._tree.query(queries, k=2, distance_upper_bound=reach_m, workers=workers)
         distances, index = np.asarray(found[0]), np.asarray(found[1])
         index = np.where(np.isfinite(distances[:, 0]), index[:, 0], -1)
         others = np.minimum(distances[:, 1], reach_m)
         return Neighbours(
             points_world,
-            places,
+            bins,
             torch.from_numpy(index).to(self._device),
             torch.from_numpy(others).to(points_world),
         )

@@ -13,11 +13,11 @@ from lidarlearn import cuda_graphs
 from lidarlearn.cuda_graphs import Padding, Recordings
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.normals import normal_map
-from lidarlearn.geometry.projection import SphericalProjection, nearest_per_slot
+from lidarlearn.geometry.projection import SphericalProjection, nearest_per_bin
 from lidarlearn.geometry.ranges import squared_ranges
 from lidarlearn.registration.association.base import Association, Neighbours
 from lidarlearn.registration.association.candidates import nearest_two
-from lidarlearn.registration.association.sliding_window import SlidingWindow
+from lidarlearn.registration.association.point_buffer import PointBuffer
 
 _PADDING, _MAP_PADDING = Padding(), Padding(least=1 << 19)
 
@@ -54,7 +54,7 @@ class Projective(Association):
 
     def clear(self) -> None:
         """Forget every scan."""
-        self._window = SlidingWindow(self._device)
+        self._buffer = PointBuffer(self._device)
         self._T_image_world = se3.identity(device=self._device)
         self._layers = torch.empty(self.projection.pixels, 0, dtype=torch.int32, device=self._device)
         self._next_layer = 0
@@ -62,41 +62,41 @@ class Projective(Association):
     @property
     def points(self) -> Float[Tensor, "m 3"]:
         """All points of the map [m], oldest first."""
-        return self._window.points
+        return self._buffer.points
 
     @property
     def normals(self) -> Float[Tensor, "m 3"]:
         """Their unit normals."""
-        return self._window.normals
+        return self._buffer.normals
 
     @property
     def recordings(self) -> Recordings:
         """Of functions that search in this map."""
-        return self._window.recordings
+        return self._buffer.recordings
 
     def points_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
         """Some of `points`, by their index."""
-        return self._window.points_at(index)
+        return self._buffer.points_at(index)
 
     def normals_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
         """Some of `normals`, by their index."""
-        return self._window.normals_at(index)
+        return self._buffer.normals_at(index)
 
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
         """Add a registered scan, and project it or, into a new image, the whole map."""
         vertices, normals, is_used = self._recorded(self._surface, points, T_world_lidar, padding=_PADDING)
         used = is_used.nonzero()[:, 0]
-        self._window.forget(frames - 1)
-        moved = self._window.push(vertices.index_select(1, used), normals.index_select(1, used).mT)
+        self._buffer.forget(frames - 1)
+        moved = self._buffer.push(vertices.index_select(1, used), normals.index_select(1, used).mT)
         if self._begins_image(T_world_lidar, frames):
             self._T_image_world.copy_(se3.inverse(T_world_lidar))
             self._layers.copy_(self._project(frames))
-            self._next_layer = len(self._window) % frames
+            self._next_layer = len(self._buffer) % frames
         else:
             if moved:
                 self._layers -= moved
             new = self._recorded(self._layer, vertices, is_used)
-            self._layers[:, self._next_layer] = torch.where(new < 0, -1, new + (self._window.end - len(used)))
+            self._layers[:, self._next_layer] = torch.where(new < 0, -1, new + (self._buffer.end - len(used)))
             self._next_layer = (self._next_layer + 1) % frames
 
     def _recorded(self, function: Callable[..., Any], *inputs: Tensor, padding: Padding | None = None) -> Any:
@@ -115,20 +115,18 @@ class Projective(Association):
         """All that is in a pixel is looked at."""
         return math.inf
 
-    def places(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    def bins(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
         """The pixel of each point, -1 outside the image."""
         return self.projection.pixel_index(se3.transform(self._T_image_world, points_world))
 
-    def nearest(
-        self, points_world: Float[Tensor, "n 3"], places: Int[Tensor, "n"], max_distance_m: float
-    ) -> Neighbours:
+    def nearest(self, points_world: Float[Tensor, "n 3"], bins: Int[Tensor, "n"], max_distance_m: float) -> Neighbours:
         """The closest map point of each pixel."""
-        candidates = self._layers.index_select(0, places.clamp(min=0))
-        nothing = (candidates < self._window.origin) | (places < 0)[:, None]
-        candidates.clamp_(min=self._window.origin)
-        nearest = nearest_two(self._window.buffer, candidates, points_world, ~nothing)
-        index = torch.where(nearest.first_m < torch.inf, nearest.index - self._window.origin, -1)
-        return Neighbours(points_world, places, index, nearest.second_m)
+        candidates = self._layers.index_select(0, bins.clamp(min=0))
+        nothing = (candidates < self._buffer.origin) | (bins < 0)[:, None]
+        candidates.clamp_(min=self._buffer.origin)
+        nearest = nearest_two(self._buffer.slot_coordinates, candidates, points_world, ~nothing)
+        index = torch.where(nearest.first_m < torch.inf, nearest.index - self._buffer.origin, -1)
+        return Neighbours(points_world, bins, index, nearest.second_m)
 
     def _begins_image(self, T_world_lidar: Float[Tensor, "4 4"], frames: int) -> bool:
         """Whether a scan sees the map from elsewhere than the image does, or there is none with so many layers."""
@@ -139,39 +137,39 @@ class Projective(Association):
         T_image_lidar = self._T_image_world.cpu() @ T_world_lidar.cpu().double()
         distance_m = T_image_lidar[:3, 3].norm().item()
         tilt_deg = math.degrees(math.acos(min(T_image_lidar[2, 2].item(), 1.0)))
-        return distance_m >= self._image_distance_m or tilt_deg >= self._image_tilt_deg or len(self._window) == 1
+        return distance_m >= self._image_distance_m or tilt_deg >= self._image_tilt_deg or len(self._buffer) == 1
 
     def _project(self, layers: int) -> Int[Tensor, "pixels layers"]:
-        """Place in the buffer of the nearest point of each scan in each pixel, a layer for each; -1 for none."""
+        """Slot in the buffer of the nearest point of each scan in each pixel, a layer for each; -1 for none."""
         if not cuda_graphs.are_used_on(self._device):
-            return self._nearest_places(self._window.coordinates, self._window.scans, layers)
+            return self._nearest_slots(self._buffer.coordinates, self._buffer.scans, layers)
         count = _MAP_PADDING.length(len(self.points))
-        numbers = torch.tensor([len(self.points), self._window.oldest_scan])
+        numbers = torch.tensor([len(self.points), self._buffer.oldest_scan])
         project = functools.partial(self._project_recorded, count, layers)
         return self.recordings(project, numbers, device=self._device, settings=("_project", count, layers))
 
     def _project_recorded(self, count: int, layers: int, numbers: Int[Tensor, "2"]) -> Int[Tensor, "pixels layers"]:
         """The same of a number of points that is recorded, some of them twice."""
         points, oldest_scan = numbers
-        places = self._window.origin + torch.arange(count, device=self._device) % points
-        coordinates, scans = self._window.at(places)
-        return self._nearest_places(coordinates, scans - oldest_scan.int(), layers)
+        slots = self._buffer.origin + torch.arange(count, device=self._device) % points
+        coordinates, scans = self._buffer.at(slots)
+        return self._nearest_slots(coordinates, scans - oldest_scan.int(), layers)
 
-    def _nearest_places(
+    def _nearest_slots(
         self, coordinates: Float[Tensor, "3 m"], scans: Int[Tensor, "m"], layers: int
     ) -> Int[Tensor, "pixels layers"]:
         local = _moved(self._T_image_world, coordinates).mT
         # One pixel more, in front, for the points that fall into none.
-        slots = self.projection.pixel_index(local).add_(1).mul_(layers).add_(scans)
-        nearest = nearest_per_slot(slots, squared_ranges(local), (self.projection.pixels + 1) * layers)
+        bins = self.projection.pixel_index(local).add_(1).mul_(layers).add_(scans)
+        nearest = nearest_per_bin(bins, squared_ranges(local), (self.projection.pixels + 1) * layers)
         nearest = nearest[layers:].unflatten(0, (self.projection.pixels, layers))
-        return torch.where(nearest < 0, -1, nearest + self._window.origin)
+        return torch.where(nearest < 0, -1, nearest + self._buffer.origin)
 
     def _layer(self, coordinates: Float[Tensor, "3 m"], is_used: Bool[Tensor, "m"]) -> Int[Tensor, "pixels"]:
         """Which of a scan's used points, counted from 0, is the nearest in each pixel of the image; -1 for none."""
         local = _moved(self._T_image_world, coordinates).mT
-        slots = torch.where(is_used, self.projection.pixel_index(local), -1).add_(1)
-        nearest = nearest_per_slot(slots, squared_ranges(local), self.projection.pixels + 1)[1:]
+        bins = torch.where(is_used, self.projection.pixel_index(local), -1).add_(1)
+        nearest = nearest_per_bin(bins, squared_ranges(local), self.projection.pixels + 1)[1:]
         number = is_used.cumsum(0, dtype=torch.int32) - 1
         return torch.where(nearest < 0, -1, number[nearest.clamp(min=0)])
 

@@ -8,19 +8,19 @@ from torch import Tensor
 
 from lidarlearn import cuda_graphs
 from lidarlearn.cuda_graphs import Recordings
-from lidarlearn.registration.association.aggregated_map import AggregatedMap
-from lidarlearn.registration.association.aggregated_points import voxels_reached
 from lidarlearn.registration.association.base import Neighbours
 from lidarlearn.registration.association.candidates import NearestTwo, joined, nearest_two
+from lidarlearn.registration.association.voxel_map import voxels_reached
+from lidarlearn.registration.association.voxel_map_association import VoxelMapAssociation
 
-_CANDIDATES_AT_ONCE = 1 << 19  # bounds the memory of a wide search
-_CANDIDATES_AT_ONCE_ON_GPU = 1 << 22
-_FEW_CANDIDATES = 1 << 16  # so many are looked at in the time that it takes to ask
-_MIN_RADIUS = 2  # voxels; points without a neighbour look so far, and need not look again soon
-_MAX_RADIUS = 4  # voxels; beyond, a search would visit more than 9^3 of them per point
+_MAX_CANDIDATES_AT_ONCE = 1 << 19  # bounds the memory of a wide search
+_MAX_CANDIDATES_AT_ONCE_ON_GPU = 1 << 22
+_CHEAP_CANDIDATES = 1 << 16  # are compared sooner than it is found out which points need a wider search
+_MIN_RADIUS = 2  # voxels; points without a neighbour are searched again only after they moved into this range
+_MAX_RADIUS = 4  # voxels; a search visits 9^3 of them per point
 
 
-class VoxelHash(AggregatedMap):
+class VoxelHash(VoxelMapAssociation):
     """The nearest point among the voxels around the query: exact within the search distance, up to four voxel edges.
 
     Nothing is built per scan: the table of the aggregated map is the search structure. It runs on tensors alone, on
@@ -39,15 +39,13 @@ class VoxelHash(AggregatedMap):
         reaches = (voxels * self._voxel_size_m for voxels in (1.5, _MIN_RADIUS))
         return next((reach_m for reach_m in reaches if max_distance_m <= reach_m), math.inf)
 
-    def nearest(
-        self, points_world: Float[Tensor, "n 3"], places: Int[Tensor, "n"], max_distance_m: float
-    ) -> Neighbours:
+    def nearest(self, points_world: Float[Tensor, "n 3"], bins: Int[Tensor, "n"], max_distance_m: float) -> Neighbours:
         """The nearest point in wider and wider cubes of voxels around each point, until none can be nearer."""
         if cuda_graphs.are_used_on(points_world.device):
-            return self._nearest_at_once(points_world, places, max_distance_m)
+            return self._nearest_at_once(points_world, bins, max_distance_m)
         widest = max(_MIN_RADIUS, min(math.ceil(max_distance_m / self._voxel_size_m), _MAX_RADIUS))
         radius = 1
-        while radius < widest and len(points_world) * (2 * radius + 3) ** 3 <= _FEW_CANDIDATES:
+        while radius < widest and len(points_world) * (2 * radius + 3) ** 3 <= _CHEAP_CANDIDATES:
             radius += 1
         found = self._within(points_world, radius)
         searched_m = torch.full_like(found.first_m, radius * self._voxel_size_m)
@@ -56,17 +54,17 @@ class VoxelHash(AggregatedMap):
             found = found.improved(alone, self._within(points_world[alone], radius, inner=radius - 1))
             searched_m[alone] = radius * self._voxel_size_m
         index = found.index - self._map.origin
-        return Neighbours(points_world, places, index, torch.minimum(found.second_m, searched_m))
+        return Neighbours(points_world, bins, index, torch.minimum(found.second_m, searched_m))
 
     def _within(self, points: Float[Tensor, "n 3"], radius: int, inner: int = -1) -> NearestTwo:
-        """The nearest of a cube of voxels around each point, see `AggregatedPoints.around`."""
-        chunks = points.split(max(_CANDIDATES_AT_ONCE // (2 * radius + 1) ** 3, 1))
-        return joined([nearest_two(self._map.buffer, self._map.around(c, radius, inner), c) for c in chunks])
+        """The nearest of a cube of voxels around each point, see `VoxelMap.around`."""
+        chunks = points.split(max(_MAX_CANDIDATES_AT_ONCE // (2 * radius + 1) ** 3, 1))
+        return joined([nearest_two(self._map.slot_coordinates, self._map.around(c, radius, inner), c) for c in chunks])
 
-    def _nearest_at_once(self, points_world: Tensor, places: Tensor, max_distance_m: float) -> Neighbours:
+    def _nearest_at_once(self, points_world: Tensor, bins: Tensor, max_distance_m: float) -> Neighbours:
         """The same in the cube of voxels that the distance reaches, without asking what was found on the way."""
         reach_m = min(max_distance_m, _MAX_RADIUS * self._voxel_size_m)
         candidates = voxels_reached(reach_m, self._voxel_size_m) ** 3
-        chunks = points_world.split(max(_CANDIDATES_AT_ONCE_ON_GPU // candidates, 1))
-        found = joined([nearest_two(self._map.buffer, self._map.reached(c, reach_m), c) for c in chunks])
-        return Neighbours(points_world, places, found.index - self._map.origin, found.second_m.clamp(max=reach_m))
+        chunks = points_world.split(max(_MAX_CANDIDATES_AT_ONCE_ON_GPU // candidates, 1))
+        found = joined([nearest_two(self._map.slot_coordinates, self._map.reached(c, reach_m), c) for c in chunks])
+        return Neighbours(points_world, bins, found.index - self._map.origin, found.second_m.clamp(max=reach_m))

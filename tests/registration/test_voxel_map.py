@@ -4,7 +4,7 @@ from torch import Tensor
 
 from lidarlearn.geometry.normals import fit_planes
 from lidarlearn.geometry.voxels import grid_sample, voxel_cells
-from lidarlearn.registration.association.aggregated_points import AggregatedPoints
+from lidarlearn.registration.association.voxel_map import VoxelMap
 from tests.registration import maps
 
 VOXEL = 0.4
@@ -45,7 +45,7 @@ def slow_normal(points: Tensor, index: int) -> Tensor | None:
 
 
 def test_one_point_per_voxel():
-    cloud = AggregatedPoints(VOXEL, CPU)
+    cloud = VoxelMap(VOXEL, CPU)
     for points in scans(4):
         cloud.insert(points, frames=30)
     cells = voxel_cells(cloud.points, VOXEL)
@@ -53,7 +53,7 @@ def test_one_point_per_voxel():
 
 
 def test_every_voxel_of_the_scans_is_occupied_by_one_of_their_points():
-    cloud, world = AggregatedPoints(VOXEL, CPU), scans(3)
+    cloud, world = VoxelMap(VOXEL, CPU), scans(3)
     for points in world:
         cloud.insert(points, frames=30)
     everything = torch.cat(world)
@@ -65,7 +65,7 @@ def test_every_voxel_of_the_scans_is_occupied_by_one_of_their_points():
 
 
 def test_scans_are_forgotten_after_their_time():
-    cloud, world = AggregatedPoints(VOXEL, CPU), [torch.tensor([[10.0 * i, 0.0, 0.0]]) for i in range(12)]
+    cloud, world = VoxelMap(VOXEL, CPU), [torch.tensor([[10.0 * i, 0.0, 0.0]]) for i in range(12)]
     for i, points in enumerate(world):
         cloud.insert(points, frames=4)
         expected = torch.cat(world[max(0, i - 3) : i + 1])
@@ -75,7 +75,7 @@ def test_scans_are_forgotten_after_their_time():
 
 
 def test_a_place_seen_again_after_it_was_forgotten_is_mapped_again():
-    cloud, here, there = AggregatedPoints(VOXEL, CPU), torch.tensor([[0.1, 0.1, 0.1]]), torch.tensor([[50.0, 0, 0]])
+    cloud, here, there = VoxelMap(VOXEL, CPU), torch.tensor([[0.1, 0.1, 0.1]]), torch.tensor([[50.0, 0, 0]])
     cloud.insert(here, frames=2)
     cloud.insert(here + 0.05, frames=2)  # its voxel is taken
     assert torch.equal(cloud.points, here)
@@ -86,7 +86,7 @@ def test_a_place_seen_again_after_it_was_forgotten_is_mapped_again():
 
 
 def test_empty_scans_count_as_scans():
-    cloud = AggregatedPoints(VOXEL, CPU)
+    cloud = VoxelMap(VOXEL, CPU)
     cloud.insert(torch.zeros(1, 3), frames=2)
     cloud.insert(torch.zeros(0, 3), frames=2)
     assert len(cloud.points) == 1
@@ -96,7 +96,7 @@ def test_empty_scans_count_as_scans():
 
 @pytest.mark.parametrize("world", [scans(4), scans(4, "room"), wandering(20)], ids=["street", "room", "wandering"])
 def test_normals_kept_up_incrementally_equal_those_from_scratch(world):
-    cloud = AggregatedPoints(VOXEL, CPU)
+    cloud = VoxelMap(VOXEL, CPU)
     for points in world:
         cloud.insert(points, frames=100)
     chosen = range(0, len(cloud.points), max(len(cloud.points) // 300, 1))
@@ -121,7 +121,7 @@ def _is_border(points: Tensor, index: int) -> bool:
 
 def test_compaction_keeps_points_normals_and_places():
     """Buffers of a few points are moved at every other scan; one that never fills is the reference."""
-    small, large, world = AggregatedPoints(VOXEL, CPU), AggregatedPoints(VOXEL, CPU), wandering(60)
+    small, large, world = VoxelMap(VOXEL, CPU), VoxelMap(VOXEL, CPU), wandering(60)
     small._reserve(64)
     for points in world:
         small.insert(points, frames=5)
@@ -134,7 +134,7 @@ def test_compaction_keeps_points_normals_and_places():
 
 
 def test_memory_is_bounded_by_the_window():
-    cloud = AggregatedPoints(VOXEL, CPU)
+    cloud = VoxelMap(VOXEL, CPU)
     cloud._reserve(64)
     most_living = 0
     for points in wandering(400, n=120):
@@ -146,7 +146,7 @@ def test_memory_is_bounded_by_the_window():
 def test_planes_of_a_flat_floor_are_level():
     grid = torch.arange(-20, 20) * 0.3
     floor = torch.cartesian_prod(grid, grid, torch.tensor([-1.7]))
-    cloud = AggregatedPoints(VOXEL, CPU)
+    cloud = VoxelMap(VOXEL, CPU)
     cloud.insert(floor, frames=1)
     level = cloud.normals[:, 2].abs()
     assert (level > 0.9999).float().mean() > 0.95
@@ -156,14 +156,14 @@ def test_planes_of_a_flat_floor_are_level():
 def test_a_single_line_of_points_has_no_normals():
     x = torch.arange(0, 20, 0.2)
     line = torch.stack([x, torch.zeros_like(x), 0.01 * torch.sin(20 * x)], dim=1)
-    cloud = AggregatedPoints(VOXEL, CPU)
+    cloud = VoxelMap(VOXEL, CPU)
     cloud.insert(line, frames=1)
     assert not cloud.normals.any()
 
 
 def test_moments_at_a_great_distance_from_the_origin_lose_little():
     world, far = wandering(5), torch.tensor([8192.0, -4096.0, 0.0])
-    near_cloud, far_cloud = AggregatedPoints(0.5, CPU), AggregatedPoints(0.5, CPU)  # shifts by whole voxels
+    near_cloud, far_cloud = VoxelMap(0.5, CPU), VoxelMap(0.5, CPU)  # shifts by whole voxels
     for points in world:
         points = (points * 64).round() / 64  # a grid that both places can represent
         near_cloud.insert(points, frames=30)

@@ -1,11 +1,11 @@
 import torch
 
-from lidarlearn.registration.association.sliding_window import SlidingWindow
+from lidarlearn.registration.association.point_buffer import PointBuffer
 
 
 def test_the_last_scans_stand_behind_each_other_however_often_the_buffers_are_full():
     generator = torch.Generator().manual_seed(0)
-    window, scans = SlidingWindow(torch.device("cpu")), []
+    window, scans = PointBuffer(torch.device("cpu")), []
     for length in torch.randint(0, 30_000, (40,), generator=generator).tolist():
         points = torch.randn(3, length, generator=generator)
         window.forget(4)
@@ -19,7 +19,7 @@ def test_the_last_scans_stand_behind_each_other_however_often_the_buffers_are_fu
 
 
 def test_fewer_scans_can_be_kept_later_on():
-    window = SlidingWindow(torch.device("cpu"))
+    window = PointBuffer(torch.device("cpu"))
     for scans in (3, 3, 3, 1):
         window.forget(scans - 1)
         window.push(torch.ones(3, 4) * scans, torch.zeros(4, 3))

@@ -6,19 +6,21 @@ from torch import Tensor
 
 from lidarlearn import cuda_graphs
 
-_CAPACITY = 1 << 16  # points at first
-_CAPACITY_ON_GPU = 1 << 21  # as many as 30 scans need: where buffers move, all that was recorded is recorded again
+_INITIAL_CAPACITY = 1 << 16  # points
+_INITIAL_CAPACITY_ON_GPU = (
+    1 << 21
+)  # as many as 30 scans need: where buffers move, all that was recorded is recorded again
 
 
-class SlidingWindow:
+class PointBuffer:
     """Points and normals of the last scans, oldest first: a new scan is written behind the others, none is moved.
 
     Coordinates lie apart in memory: projections and distances are computed axis by axis. Forgetting moves the start of
     a slice; only when the end of the buffers is reached, once in many scans, what is left moves to their front.
 
     Attributes:
-        buffer: the coordinates (3, capacity), those of points that are forgotten or still to come among them.
-        origin: where the points begin in it, a number on the device.
+        slot_coordinates: coordinates (3, capacity) by slot, those of forgotten points and of free slots included.
+        origin: the slot of the first point, a number on the device.
         recordings: of functions that read the buffers where they are.
 
     Args:
@@ -32,7 +34,7 @@ class SlidingWindow:
         self._forgotten = 0
         self.origin = torch.zeros((), dtype=torch.int32, device=device)
         self.recordings = cuda_graphs.Recordings()
-        self._reserve(_CAPACITY_ON_GPU if cuda_graphs.are_used_on(device) else _CAPACITY)
+        self._reserve(_INITIAL_CAPACITY_ON_GPU if cuda_graphs.are_used_on(device) else _INITIAL_CAPACITY)
 
     @property
     def points(self) -> Float[Tensor, "n 3"]:
@@ -42,7 +44,7 @@ class SlidingWindow:
     @property
     def coordinates(self) -> Float[Tensor, "3 n"]:
         """The same, each coordinate of all points in one piece."""
-        return self.buffer[:, self._start : self._end]
+        return self.slot_coordinates[:, self._start : self._end]
 
     @property
     def normals(self) -> Float[Tensor, "n 3"]:
@@ -51,7 +53,7 @@ class SlidingWindow:
 
     def points_at(self, index: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
         """Some of `points`, by their index."""
-        return self.buffer.index_select(1, index + self.origin).mT.contiguous()
+        return self.slot_coordinates.index_select(1, index + self.origin).mT.contiguous()
 
     def normals_at(self, index: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
         """Some of `normals`, by their index."""
@@ -59,7 +61,7 @@ class SlidingWindow:
 
     @property
     def end(self) -> int:
-        """Where the points end in `buffer`."""
+        """The slot behind the last point."""
         return self._end
 
     def __len__(self) -> int:
@@ -68,8 +70,8 @@ class SlidingWindow:
 
     def push(self, coordinates: Float[Tensor, "3 m"], normals: Float[Tensor, "m 3"]) -> int:
         """Add a scan; returns by how much all others have moved to the front of the buffers."""
-        new, moved = self._claim(coordinates.shape[1])
-        self.buffer[:, new] = coordinates
+        new, moved = self._allocate(coordinates.shape[1])
+        self.slot_coordinates[:, new] = coordinates
         self._normals[new] = normals
         self._scans[new] = self._forgotten + len(self) - 1
         return moved
@@ -79,9 +81,9 @@ class SlidingWindow:
         """Which scan each point comes from, 0 for the oldest."""
         return self._scans[self._start : self._end] - self.oldest_scan
 
-    def at(self, places: Int[Tensor, "m"]) -> tuple[Float[Tensor, "3 m"], Int[Tensor, "m"]]:
-        """Coordinates of the points at some places in the buffer, and the number of the scan each comes from."""
-        return self.buffer[:, places], self._scans[places]
+    def at(self, slots: Int[Tensor, "m"]) -> tuple[Float[Tensor, "3 m"], Int[Tensor, "m"]]:
+        """Coordinates of the points in some slots, and the number of the scan each comes from."""
+        return self.slot_coordinates[:, slots], self._scans[slots]
 
     @property
     def oldest_scan(self) -> int:
@@ -101,12 +103,12 @@ class SlidingWindow:
     def _capacity(self) -> int:
         return len(self._normals)
 
-    def _claim(self, count: int, spare: int = 0) -> tuple[slice, int]:
+    def _allocate(self, count: int, spare: int = 0) -> tuple[slice, int]:
         """Where the points of a new scan will stand in the buffers, and by how much the others have moved to the front.
 
         Args:
             count: how many they are.
-            spare: how many more places behind them may be written to.
+            spare: how many more slots behind them may be written to.
         """
         moved = 0
         if self._end + count + spare > self._capacity:
@@ -120,20 +122,20 @@ class SlidingWindow:
     def _move_to_front(self, needed: int) -> None:
         """Of these buffers or, where they would soon be full again, of larger ones."""
         count = self._end - self._start
-        living = [rows[self._start : self._end].clone() for rows in self._rows()]
+        living = [rows[self._start : self._end].clone() for rows in self._buffers()]
         if 2 * (count + needed) > self._capacity:
             self._reserve(2 * (count + needed))
-        for rows, content in zip(self._rows(), living, strict=True):
+        for rows, content in zip(self._buffers(), living, strict=True):
             rows[:count] = content
         self._start, self._end = 0, count
         self.origin.zero_()
 
-    def _rows(self) -> tuple[Tensor, ...]:
+    def _buffers(self) -> tuple[Tensor, ...]:
         """The buffers, one row a point."""
-        return self.buffer.mT, self._normals, self._scans
+        return self.slot_coordinates.mT, self._normals, self._scans
 
     def _reserve(self, capacity: int) -> None:
-        self.buffer = torch.empty(3, capacity, device=self._device)
+        self.slot_coordinates = torch.empty(3, capacity, device=self._device)
         self._normals = torch.empty(capacity, 3, device=self._device)
         self._scans = torch.empty(capacity, dtype=torch.int32, device=self._device)
         self.recordings.forget()

@@ -5,11 +5,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.registration.association.aggregated_points import AggregatedPoints
 from lidarlearn.registration.association.base import Association
+from lidarlearn.registration.association.voxel_map import VoxelMap
 
 
-class AggregatedMap(Association):
+class VoxelMapAssociation(Association):
     """An association with the points of the last scans aggregated.
 
     Args:
@@ -26,7 +26,7 @@ class AggregatedMap(Association):
 
     def clear(self) -> None:
         """Forget every scan."""
-        self._map = AggregatedPoints(self._voxel_size_m, self._device)
+        self._map = VoxelMap(self._voxel_size_m, self._device)
 
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
         """Add a registered scan."""

@@ -17,9 +17,9 @@ from lidarlearn import cuda_graphs
 from lidarlearn.errors import require_positive
 from lidarlearn.geometry.normals import fit_planes
 from lidarlearn.geometry.voxels import grid_sample, voxel_cells
-from lidarlearn.registration.association.sliding_window import SlidingWindow
+from lidarlearn.registration.association.point_buffer import PointBuffer
 
-# The table wraps around in space: two voxels share a slot only if they are 512 (512, 64) cells apart, 205 m (26 m) at
+# The table wraps around in space: two voxels share an entry only if they are 512 (512, 64) cells apart, 205 m (26 m) at
 # 0.4 m, so neighbours never collide and stand side by side in memory. Of two points that share one, 7 of 97,000 on a
 # motorway, the later is found.
 _TABLE_BITS = (9, 9, 6)
@@ -29,7 +29,7 @@ _MAX_ROUGHNESS = 0.5  # deviation from the plane over the smaller extent in it
 _MIN_EXTENT = 0.15  # smaller extent in the plane over the voxel size: a line of points, as of one beam, has no normal
 
 
-class AggregatedPoints(SlidingWindow):
+class VoxelMap(PointBuffer):
     """A growing and forgetting point cloud with one point per voxel, its normals kept up incrementally.
 
     Each point carries the moments of the points that were ever seen in the 26 voxels around it, while it lives. A new
@@ -58,7 +58,7 @@ class AggregatedPoints(SlidingWindow):
         points_world = points_world[grid_sample(points_world, self.voxel_size_m, self.recordings)]
         count = len(points_world)
         padding = _PADDING.length(count) - count if cuda_graphs.are_used_on(self._device) else 0
-        new, _ = self._claim(count, spare=padding)
+        new, _ = self._allocate(count, spare=padding)
         self._recorded(self._add, points_world, torch.tensor(new.start))
 
     def _recorded(self, function: Callable[..., Any], *inputs: Tensor) -> Any:
@@ -69,7 +69,7 @@ class AggregatedPoints(SlidingWindow):
 
     def lookup(self, cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
         """Index into `points` of the point in each voxel, -1 where there is none."""
-        index = self._table[_slots(cells)]
+        index = self._table[_entries(cells)]
         alive = index >= self.origin
         same = (self._cells[index.clamp(min=0)] == cells).all(dim=-1)
         return torch.where(alive & same, index - self.origin, -1).long()
@@ -83,7 +83,7 @@ class AggregatedPoints(SlidingWindow):
             inner: voxels up to this number of steps away are left out.
 
         Returns:
-            Places in `buffer`. An empty voxel, or one whose slot another voxel took, gives a point from anywhere:
+            Slots. An empty voxel, or one whose entry another voxel took, gives a point from anywhere:
             distances tell them apart, which is cheaper than to compare voxels.
         """
         cells = voxel_cells(points_world, self.voxel_size_m)
@@ -105,26 +105,26 @@ class AggregatedPoints(SlidingWindow):
         self, cells: Int[Tensor, "m 3"], steps: Int[Tensor, "k"], used: Bool[Tensor, "cube"] | None = None
     ) -> Int[Tensor, "m c"]:
         """What the table says of the voxels so many steps from each voxel along all axes, z fastest."""
-        x, y, z = (_axis_slots(cells[:, axis, None] + steps, axis) for axis in range(3))
-        slots = (x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]).flatten(1)
+        x, y, z = (_axis_entries(cells[:, axis, None] + steps, axis) for axis in range(3))
+        entries = (x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]).flatten(1)
         if used is not None:
-            slots = slots[:, used]
-        return self._table.index_select(0, slots.flatten()).view_as(slots)
+            entries = entries[:, used]
+        return self._table.index_select(0, entries.flatten()).view_as(entries)
 
     def _add(self, points_world: Float[Tensor, "m 3"], first: Int[Tensor, ""]) -> None:
-        """Write points to their places, from the first on, and let them and their neighbours count each other.
+        """Write points to their slots, from the first on, and let them and their neighbours count each other.
 
         A point that is NaN is none: it is written behind the others, where nothing is yet.
         """
         new = first + torch.arange(len(points_world), device=self._device)
         cells = voxel_cells(points_world, self.voxel_size_m)
-        self.buffer.index_copy_(1, new, points_world.mT)
+        self.slot_coordinates.index_copy_(1, new, points_world.mT)
         self._cells.index_copy_(0, new, cells)
         self._moments.index_fill_(0, new, 0)
         is_point = points_world[:, 0].isfinite()
-        self._table[torch.where(is_point, _slots(cells), len(self._table) - 1)] = new.int()
+        self._table[torch.where(is_point, _entries(cells), len(self._table) - 1)] = new.int()
         pairs = self._pairs(cells, is_point)
-        offsets = self.buffer[:, pairs.old] - points_world.mT[:, pairs.new]
+        offsets = self.slot_coordinates[:, pairs.old] - points_world.mT[:, pairs.new]
         one = pairs.count.to(offsets)
         x, y, z = torch.where(pairs.count, offsets, 0.0)
         squares = (x * x, x * y, x * z, y * y, y * z, z * z)
@@ -145,13 +145,13 @@ class AggregatedPoints(SlidingWindow):
             new, column = occupied.nonzero(as_tuple=True)
             old, occupied = candidates[new, column].long(), occupied[new, column]
         offsets = self._cells[old] - cells[new]
-        # A slot may be another voxel's.
+        # An entry may be another voxel's.
         near = (offsets.abs().amax(dim=1) <= 1) & (offsets != 0).any(dim=1) & occupied & is_point[new]
         pairs = _Pairs(new, old, near)
         return pairs if cuda_graphs.are_used_on(self._device) else pairs.counted()
 
     def _fit(self, index: Int[Tensor, "m"]) -> None:
-        """Fit planes to places in the buffers; where nothing has changed nothing does."""
+        """Fit planes to slots in the buffers; where nothing has changed nothing does."""
         if not cuda_graphs.are_used_on(self._device):
             index = self._once(index)
         moments = self._moments[index]
@@ -163,7 +163,7 @@ class AggregatedPoints(SlidingWindow):
         self._normals[index] = plane.normals * _is_plane(moments[:, 0], plane.variances, smallest_extent)[:, None]
 
     def _once(self, index: Int[Tensor, "m"]) -> Int[Tensor, "k"]:
-        """Each of the places once."""
+        """Each of the slots once."""
         occurs = torch.zeros(self._end - self._start, dtype=torch.bool, device=self._device)
         occurs[index - self._start] = True
         return occurs.nonzero()[:, 0] + self._start
@@ -172,15 +172,23 @@ class AggregatedPoints(SlidingWindow):
         super()._move_to_front(needed)
         self._table.fill_(-1)
         living = self._cells[: self._end]
-        self._table[_slots(living)] = torch.arange(len(living), dtype=torch.int32, device=self._device)
+        self._table[_entries(living)] = torch.arange(len(living), dtype=torch.int32, device=self._device)
 
-    def _rows(self) -> tuple[Tensor, ...]:
-        return *super()._rows(), self._cells, self._moments
+    def _buffers(self) -> tuple[Tensor, ...]:
+        return *super()._buffers(), self._cells, self._moments
 
     def _reserve(self, capacity: int) -> None:
         super()._reserve(capacity)
         self._cells = torch.empty(capacity, 3, dtype=torch.int32, device=self._device)
         self._moments = torch.empty(capacity, 10, device=self._device)
+
+
+def neighbourhood_normals(points: Float[Tensor, "n 3"], voxel_size_m: float) -> Float[Tensor, "n 3"]:
+    """Normals of a scan's points from the points in the voxels around each, zero where they span no plane."""
+    surface = VoxelMap(voxel_size_m, points.device)
+    surface.insert(points, frames=1)
+    index = surface.lookup(voxel_cells(points, voxel_size_m))
+    return torch.where((index >= 0)[:, None], surface.normals[index.clamp(min=0)], 0.0)
 
 
 def voxels_reached(reach_m: float, voxel_size_m: float) -> int:
@@ -190,7 +198,7 @@ def voxels_reached(reach_m: float, voxel_size_m: float) -> int:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Pairs of neighbours: which of the new points, which place in the buffers, and whether the pair counts."""
+    """Pairs of neighbours: which of the new points, which slot in the buffers, and whether the pair counts."""
 
     new: Int[Tensor, "p"]
     old: Int[Tensor, "p"]
@@ -216,11 +224,11 @@ def _is_plane(
     return (neighbours >= _MIN_NEIGHBOURS) & extended & (across <= _MAX_ROUGHNESS**2 * along)
 
 
-def _slots(cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
-    x, y, z = (_axis_slots(cells[..., axis], axis) for axis in range(3))
+def _entries(cells: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
+    x, y, z = (_axis_entries(cells[..., axis], axis) for axis in range(3))
     return x | y | z
 
 
-def _axis_slots(cells: Int[Tensor, "*batch"], axis: int) -> Int[Tensor, "*batch"]:
+def _axis_entries(cells: Int[Tensor, "*batch"], axis: int) -> Int[Tensor, "*batch"]:
     """The part of a table index that comes from one coordinate."""
     return (cells & ((1 << _TABLE_BITS[axis]) - 1)) << sum(_TABLE_BITS[axis + 1 :])
