@@ -33,7 +33,7 @@ class Probe:
         offsets_m: lengths by which the initial position is off, each in several horizontal directions [m].
         angles_deg: angles by which the initial yaw is off, to both sides [deg].
         directions: number of directions for each length.
-        every: a scan is tried out of so many; the others only fill the map.
+        every: only each n-th scan is tried; the others fill the map.
         min_range_m: closer returns are dropped [m].
         max_range_m: farther returns are dropped [m].
         success_m: a registration succeeds when it ends closer than this to where it ends from the true pose [m]...

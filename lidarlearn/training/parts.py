@@ -55,6 +55,22 @@ def build(node: Mapping[str, Any], kind: type, **arguments: Any) -> Any:
         raise UserError(f"{name}: {error}\n  it was given {given}") from error
 
 
+def argument(node: Mapping[str, Any], key: str) -> Any:
+    """The value of a part's setting: the constructor's default where the dict, such as an older one, does not have it.
+
+    Args:
+        node: see `build`.
+        key: of the setting.
+
+    Returns:
+        None where the constructor takes no such argument, or has no default for it.
+    """
+    if key in node:
+        return node[key]
+    parameter = inspect.signature(_trusted(node.get("_target_"), object)).parameters.get(key)
+    return None if parameter is None or parameter.default is parameter.empty else parameter.default
+
+
 def require_trusted(node: Mapping[str, Any], kind: type) -> None:
     """Check that a config out of a checkpoint describes a thing of that kind, and can do nothing but describe it.
 

@@ -9,6 +9,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 from lidarlearn.errors import UserError
 from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.module import PoseNetModule
+from lidarlearn.training.parts import argument
 from lidarlearn.training.progress import time_left_s
 
 _FIXED = ("model", "loss", "optimizer", "scheduler")
@@ -25,11 +26,11 @@ def require_resumable(path: Path, module: PoseNetModule, trainer: Trainer) -> No
     checkpoint = load_checkpoint(path)
     for part in _FIXED:
         was, now = checkpoint["hyper_parameters"][part], module.hparams[part]
-        changed = [key for key in {**was, **now} if was.get(key) != now.get(key)]
+        values = {key: (argument(was, key), argument(now, key)) for key in {**was, **now}}
+        changed = [f"{key} was {before} and is {after}" for key, (before, after) in values.items() if before != after]
         if changed:
-            differences = ", ".join(f"{key} was {was.get(key)} and is {now.get(key)}" for key in changed)
             raise UserError(
-                f"ckpt={path} does not go on with another {part}: {differences}\n"
+                f"ckpt={path} does not go on with another {part}: {', '.join(changed)}\n"
                 f"  change: leave the settings of the {part} to the checkpoint, or train anew, without ckpt"
             )
     loop = checkpoint["loops"]["fit_loop"]

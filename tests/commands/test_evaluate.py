@@ -207,7 +207,7 @@ def test_basins_of_convergence_are_measured_and_drawn(scans, tmp_path, monkeypat
     monkeypatch.setattr(
         sys, "argv",
         ["x", "convergence", "data=folder", f"data.root={scans}", *SENSOR, "data.test_sequences=['0']",
-         "backends=[p_f2m,kd_f2m]", "probe.every=3", "+probe.offsets_m=[0.1,20.0]", "+probe.angles_deg=[1.0,170.0]",
+         "backends=[p_f2m,kd_f2m]", "probe.every=3", "probe.offsets_m=[0.1,20.0]", "probe.angles_deg=[1.0,170.0]",
          f"hydra.run.dir={tmp_path}"],
     )  # fmt: skip
     evaluation.main()

@@ -113,7 +113,7 @@ def test_the_recipe_of_the_checkpoint_comes_after_another(checkpoint, tmp_path, 
     assert config.datamodule.batch_size == 2 and config.data.max_frames == FRAMES
 
 
-def test_a_schedule_without_milestones_goes_on_too(checkpoint, tmp_path):
+def test_a_schedule_without_milestones_goes_on_too_and_what_it_left_to_defaults_is_no_change(checkpoint, tmp_path):
     content = torch.load(checkpoint, weights_only=True)
     parts = content["hyper_parameters"]
     parts["scheduler"] = {"_target_": "lidarlearn.training.schedules.WarmUpCosine", "total_steps": None}
@@ -121,6 +121,12 @@ def test_a_schedule_without_milestones_goes_on_too(checkpoint, tmp_path):
     torch.save(content, tmp_path / "cosine.ckpt")
     config = composed(tmp_path / "o", tmp_path / "cosine.ckpt")
     assert OmegaConf.to_container(config, resolve=True)["scheduler"] == "cosine"
+    module = train.build_module(config, instantiate(config.datamodule), "folder")
+    trainer = Trainer(accelerator="cpu", max_epochs=3)
+    require_resumable(tmp_path / "cosine.ckpt", module, trainer)
+    module.hparams["scheduler"]["start_share"] = 0.3
+    with pytest.raises(UserError, match=r"start_share was 0\.1 and is 0\.3"):
+        require_resumable(tmp_path / "cosine.ckpt", module, trainer)
 
 
 def test_the_command_line_and_experiments_come_after_the_checkpoint(checkpoint, tmp_path):

@@ -11,6 +11,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
 from lidarlearn.commands.configs import config_directory
+from tests.commands.binding import check_binds
 
 CONFIGS = config_directory()
 GROUPS = ("data", "datamodule", "model", "module", "loss", "optimizer", "trainer", "callbacks", "logger")
@@ -22,18 +23,6 @@ def composed(*overrides: str) -> DictConfig:
         return compose("train", ["run_dir=run", *overrides])
 
 
-def check_binds(node: dict) -> None:
-    """Every `_target_` below takes the keys beside it, and all keys that it cannot do without are there or made."""
-    if "_target_" in node:
-        signature = inspect.signature(get_object(node["_target_"]))
-        signature.bind_partial(**{key: value for key, value in node.items() if key != "_target_"})
-        if node["_target_"].startswith("lidarlearn."):  # so that a typo is an error
-            assert not any(p.kind is p.VAR_KEYWORD for p in signature.parameters.values()), node["_target_"]
-    for value in node.values():
-        if isinstance(value, dict):
-            check_binds(value)
-
-
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes_and_binds_to_its_target(group, option):
     config = composed(f"{group}={option}")
@@ -41,10 +30,10 @@ def test_every_option_composes_and_binds_to_its_target(group, option):
     if group == "trainer":  # Lightning wraps the signature
         node = {key: value for key, value in node.items() if key not in ("_target_", "logger", "callbacks")}
         assert node.keys() <= inspect.signature(Trainer).parameters.keys()
-    elif group == "data":
-        inspect.signature(get_object(node["_target_"])).bind(**{k: v for k, v in node.items() if k != "_target_"})
     else:
         check_binds(node)
+    if group == "data":
+        inspect.signature(get_object(node["_target_"])).bind(**{k: v for k, v in node.items() if k != "_target_"})
 
 
 def test_every_scheduler_can_be_chosen_by_its_name():
