@@ -37,7 +37,7 @@ def find_bags(root: Path) -> dict[str, Path]:
         return {bag_name(root): root}
     files = list_scans(root, SUFFIXES)
     bags = [files.path(i) for i in range(len(files))]
-    bags += [f for f in subfolders(root) if (f / _METADATA).is_file() or holds_scans(f, SUFFIXES)]
+    bags += [f for f in subfolders(root) if os.path.isfile(f / _METADATA) or holds_scans(f, SUFFIXES)]
     alike = Counter(map(bag_name, bags))
     named = {bag_name(bag) if alike[bag_name(bag)] == 1 else bag.name: bag for bag in bags}
     return dict(sorted(named.items(), key=lambda bag: natural_key(bag[0])))

@@ -21,7 +21,7 @@ from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.ground_truth import describe_ground_truth, find_ground_truth, read_ground_truth
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import read_numbers
-from lidarlearn.data.scan_files import ScanFiles, holds_scans, list_scans, subfolders
+from lidarlearn.data.scan_files import ScanFiles, holds_scans, is_folder, list_scans, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.data.sweep_stamps import sweep_clock
 from lidarlearn.errors import UserError
@@ -156,7 +156,7 @@ class Folder(DataSetOnDisk):
     def check_sequence(self, report: LayoutReport, name: str) -> None:
         """Scans of one kind, times and ground truth."""
         folder = self._folder(name)
-        if not folder.is_dir():
+        if not is_folder(folder):
             report.missing(name, f"no folder {name}")
             return
         scans = list_scans(folder, SUFFIXES)
@@ -181,7 +181,7 @@ class Folder(DataSetOnDisk):
 
     def _folder(self, name: str) -> Path:
         folder = self.root / name
-        return self.root if name == self.root.absolute().name and not folder.is_dir() else folder
+        return self.root if name == self.root.absolute().name and not is_folder(folder) else folder
 
 
 def find_sequences(root: Path) -> tuple[str, ...]:

@@ -34,7 +34,7 @@ from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import as_transforms, start_at_identity
-from lidarlearn.data.scan_files import ScanFiles, list_scans, subfolders, warn_of_gaps
+from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders, warn_of_gaps
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.progress import tracked
@@ -160,7 +160,7 @@ class FordCampus(DataSetOnDisk):
     @staticmethod
     def is_root(path: Path) -> bool:
         """Whether it holds drives with scans."""
-        return any((folder / "SCANS").is_dir() for folder in subfolders(path))
+        return any(is_folder(folder / "SCANS") for folder in subfolders(path))
 
     def found(self) -> dict[str, ScanFiles]:
         """All drives."""
@@ -168,7 +168,7 @@ class FordCampus(DataSetOnDisk):
 
     def check_sequence(self, report: LayoutReport, name: str) -> None:
         """Scans alone: they hold everything else."""
-        if not (self.root / name).is_dir():
+        if not is_folder(self.root / name):
             report.missing(name, f"no folder {name}")
             return
         scans = self._scans(name)

@@ -132,7 +132,7 @@ class KittiOdometry(DataSetOnDisk):
     def check_sequence(self, report: LayoutReport, name: str) -> None:
         """Scans, calibration, times and poses."""
         folder = self.root / "sequences" / name
-        if not folder.is_dir():
+        if not is_folder(folder):
             report.missing(name, f"no folder sequences/{name}")
             return
         scans = self._scans(name)

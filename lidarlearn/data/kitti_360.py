@@ -147,7 +147,7 @@ class Kitti360(DataSetOnDisk):
     def check_sequence(self, report: LayoutReport, name: str) -> None:
         """Scans, their times and poses; the calibration shows when the drive is opened."""
         folder = self.root / "data_3d_raw" / drive_folder(name)
-        if not folder.is_dir():
+        if not is_folder(folder):
             report.missing(name, f"no folder {folder.relative_to(self.root)}")
             return
         scans = self._scans(name)

@@ -27,6 +27,7 @@ from lidarlearn.data.oxts import read_oxts_poses, read_rigid_transform, read_tim
 from lidarlearn.data.pose_files import start_at_identity
 from lidarlearn.data.scan_files import (
     ScanFiles,
+    is_folder,
     list_scans,
     read_float32_rows,
     subfolders,
@@ -184,7 +185,7 @@ class KittiRaw(DataSetOnDisk):
     def check_sequence(self, report: LayoutReport, name: str) -> None:
         """Scans, their times, GPS/IMU packets and their calibration."""
         folder = self._folder(name)
-        if not folder.is_dir():
+        if not is_folder(folder):
             report.missing(name, f"no folder {folder.relative_to(self.root)}")
             return
         scans = self._scans(name)

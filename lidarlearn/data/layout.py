@@ -56,7 +56,6 @@ def describe_scans(
     name: str,
     scans: ScanFiles,
     bytes_per_point: int | None,
-    numbered: bool = True,
     smallest_bytes: int = 1,
 ) -> None:
     """Note how many scans there are, holes in their numbering, and files that cannot be whole.
@@ -66,7 +65,6 @@ def describe_scans(
         name: of the sequence.
         scans: its files.
         bytes_per_point: of which every size must be a multiple; None where it is not fixed.
-        numbered: whether the names count the scans, rather than giving the time or nothing.
         smallest_bytes: below which a file cannot hold a scan.
     """
     if not len(scans):
@@ -83,7 +81,7 @@ def describe_scans(
     small = ~broken & (sizes < np.median(sizes) / 4)
     if small.any():
         report.odd(name, f"{small.sum()} files less than a quarter of the usual size: {_files(scans, small)}")
-    if numbered and (holes := gaps(scans.numbers)):
+    if scans.counted and (holes := gaps(scans.numbers)):
         shown = examples(str(a) if a == b else f"{a}-{b}" for a, b in holes)
         report.odd(name, f"{len(holes)} gaps in the numbering: {shown}")
 

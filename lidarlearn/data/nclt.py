@@ -25,7 +25,7 @@ from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, start_at_identity
-from lidarlearn.data.scan_files import ScanFiles, list_scans, read_bytes, subfolders
+from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, read_bytes, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 
@@ -137,7 +137,7 @@ class Nclt(DataSetOnDisk):
     @staticmethod
     def is_root(path: Path) -> bool:
         """Whether it holds dates with scans."""
-        return any((date / "velodyne_sync").is_dir() for date in subfolders(path))
+        return any(is_folder(date / "velodyne_sync") for date in subfolders(path))
 
     def found(self) -> dict[str, ScanFiles]:
         """All dates."""
@@ -145,11 +145,11 @@ class Nclt(DataSetOnDisk):
 
     def check_sequence(self, report: LayoutReport, name: str) -> None:
         """Scans and ground truth."""
-        if not (self.root / name).is_dir():
+        if not is_folder(self.root / name):
             report.missing(name, f"no folder {name}")
             return
         scans = self._scans(name)
-        layout.describe_scans(report, name, scans, POINT.itemsize, numbered=False)
+        layout.describe_scans(report, name, scans, POINT.itemsize)
         note = report.missing if name in self.test_sequences else report.odd
         ground_truth = self._ground_truth_file(name)
         if ground_truth is None:

@@ -22,7 +22,7 @@ from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, stamped_poses, start_at_identity
-from lidarlearn.data.scan_files import ScanFiles, list_scans, subfolders
+from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.geometry.projection import SphericalProjection
 
@@ -137,7 +137,7 @@ class NewerCollege(DataSetOnDisk):
     @staticmethod
     def is_root(path: Path) -> bool:
         """Whether it holds walks with scans."""
-        return any(_scan_folder(folder).is_dir() for folder in subfolders(path))
+        return any(is_folder(_scan_folder(folder)) for folder in subfolders(path))
 
     def found(self) -> dict[str, ScanFiles]:
         """All walks."""
@@ -145,11 +145,11 @@ class NewerCollege(DataSetOnDisk):
 
     def check_sequence(self, report: LayoutReport, name: str) -> None:
         """Scans and ground truth."""
-        if not (self.root / name).is_dir():
+        if not is_folder(self.root / name):
             report.missing(name, f"no folder {name}")
             return
         scans = _scans(self.root / name)
-        layout.describe_scans(report, name, scans, bytes_per_point=None, numbered=False)
+        layout.describe_scans(report, name, scans, bytes_per_point=None)
         note = report.missing if name in self.test_sequences else report.odd
         truth = self._truth_file(name)
         if not truth.is_file():

@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from lidarlearn.errors import UserError
 _log = logging.getLogger(__name__)
 
 _SHOWN = 5  # so many examples are listed before "..."
+_STAMP = r"[1-9]\d{9}"  # begins s, ms, us or ns since 1970; what counts scans with so many digits begins with zeros
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class ScanFiles:
 
     Args:
         folder: where they are.
-        names: file names, in natural order: 9 before 10.
+        names: file names, in natural order: 9 before 10, 1583836592.119722 before 1583836592.22498.
         sizes: of each file [bytes].
         others: files of the same kind beside them whose names are not those of scans.
         like: a name that a scan might have, for whoever finds none; "" where any will do.
@@ -59,6 +61,11 @@ class ScanFiles:
     def numbers(self) -> list[int]:
         """The last number in each file's name: what data sets count their scans by; -1 where there is none."""
         return [int(found[-1]) if (found := re.findall(r"\d+", Path(name).stem)) else -1 for name in self.names]
+
+    @property
+    def counted(self) -> bool:
+        """Whether the files' names count the scans, rather than giving the time of each."""
+        return not any(re.search(_STAMP, name) for name in self.names)
 
     def select(self, indices: Iterable[int]) -> "ScanFiles":
         """Only some of the files, in the order given."""
@@ -96,7 +103,8 @@ def list_scans(folder: Path, suffixes: tuple[str, ...], stems: str = ".*", like:
         like: a name with such a stem.
     """
     found = [(e.name, e.stat().st_size) for e in _entries(folder) if _is_scan(e, suffixes)]
-    found.sort(key=lambda file: natural_key(file[0]))
+    number = _numbers_in(name for name, _ in found)
+    found.sort(key=lambda file: natural_key(file[0], number))
     scans = [(name, size) for name, size in found if re.fullmatch(stems, Path(name).stem)]
     others = {name for name, _ in found}.difference(name for name, _ in scans)
     names, sizes = tuple(n for n, _ in scans), tuple(size for _, size in scans)
@@ -109,7 +117,7 @@ def holds_scans(folder: Path, suffixes: tuple[str, ...]) -> bool:
 
 
 def _is_scan(entry: "os.DirEntry[str]", suffixes: tuple[str, ...]) -> bool:
-    return entry.name.lower().endswith(suffixes) and not entry.name.startswith(".") and entry.is_file()
+    return entry.name.lower().endswith(suffixes) and not entry.name.startswith(".") and os.path.isfile(entry.path)
 
 
 def subfolders(folder: Path) -> list[Path]:
@@ -117,23 +125,25 @@ def subfolders(folder: Path) -> list[Path]:
 
     Hidden ones are left out, and those that we may not look into, such as lost+found.
     """
-    shown = [Path(e.path) for e in _entries(folder) if e.is_dir() and not e.name.startswith(".")]
-    found = [path for path in shown if os.access(path, os.R_OK | os.X_OK)]
+    shown = (e.path for e in _entries(folder) if not e.name.startswith("."))
+    found = (Path(path) for path in shown if os.path.isdir(path) and os.access(path, os.R_OK | os.X_OK))
     return sorted(found, key=lambda path: natural_key(path.name))
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder, as far as we may look: `Path.is_dir` raises PermissionError where we may not."""
+    """Whether there is a folder, as far as we may look: `Path.is_dir` raises PermissionError where we may not.
+
+    `os.DirEntry.is_dir` does so, too, and for links that lead in a circle.
+    """
     return os.path.isdir(path)
 
 
 def _entries(folder: Path) -> list["os.DirEntry[str]"]:
     """What a folder holds; nothing where it is absent or closed to us."""
-    try:
-        with os.scandir(folder) as entries:
-            return list(entries)
-    except (FileNotFoundError, NotADirectoryError, PermissionError):
+    if not is_folder(folder) or not os.access(folder, os.R_OK):
         return []
+    with os.scandir(folder) as entries:
+        return list(entries)
 
 
 def examples(items: Iterable[str]) -> str:
@@ -142,10 +152,25 @@ def examples(items: Iterable[str]) -> str:
     return ", ".join(first[:_SHOWN]) + (", ..." if len(first) > _SHOWN else "")
 
 
-def natural_key(name: str) -> tuple[list[tuple[int, str]], str]:
-    """Sorting key under which numbers count by value: scan_9 before scan_10."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts], name
+def natural_key(name: str, number: str = r"\d+") -> tuple[list[tuple[Decimal, str]], str]:
+    """Sorting key under which numbers count by value: scan_9 before scan_10.
+
+    Args:
+        name: to be sorted.
+        number: regular expression of what counts as one.
+    """
+    parts = re.split(f"({number})", name)
+    return [(Decimal(part), "") if i % 2 else (Decimal(-1), part) for i, part in enumerate(parts)], name
+
+
+def _numbers_in(names: Iterable[str]) -> str:
+    """Regular expression of the numbers in names: with decimals where these are seconds as Python prints a float.
+
+    It leaves out the last zeros: .22498 follows .119722. Nine digits are nanoseconds, which others print without the
+    first zeros: .119722000 follows .22498. A float of such seconds has seven at most.
+    """
+    of_nanoseconds = any(re.search(rf"{_STAMP}\.\d{{8}}", name) for name in names)
+    return r"\d+" if of_nanoseconds else rf"{_STAMP}\.\d+|\d+"
 
 
 def sequence_names(names: Iterable[str | int] | str | int, digits: int = 0) -> tuple[str, ...]:

@@ -323,6 +323,7 @@ def test_fingerprint_follows_settings_and_clouds_but_not_the_place(tmp_path):
 
 
 def in_child(sequence, index, pipe):
+    torch.set_num_threads(1)  # as in a worker of a DataLoader: a forked process has no other threads to wait for
     pipe.send([first_coordinate(sequence, i) for i in index])
 
 

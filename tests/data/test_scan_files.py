@@ -19,14 +19,44 @@ def test_scans_come_in_natural_order(tmp_path):
     assert scans.first(2).names == ("scan_9.bin", "scan_10.bin")
 
 
+SECONDS = ["1583836591.22498.bin", "1583836592.0.bin", "1583836592.119722.bin", "1583836592.22498.bin"]
+NANOSECONDS = ["1583836591.1190722000.bin", "1583836592.22498.bin", "1583836592.119722000.bin"]
+
+
+@pytest.mark.parametrize("names", [SECONDS, [f"scan_{name}" for name in SECONDS], NANOSECONDS])
+def test_seconds_since_1970_come_in_their_order(tmp_path, names):
+    """As Python prints a float of them, without the last zeros; or with nanoseconds that lack the first ones."""
+    for name in sorted(names):
+        (tmp_path / name).touch()
+    assert list(list_scans(tmp_path, (".bin",)).names) == names
+
+
+@pytest.mark.parametrize(
+    ("names", "counted"),
+    [
+        (SECONDS, False),
+        (["1326030975726043.bin", "1326030975925839.bin"], False),
+        (["cloud_1583836591_182590976.bin"], False),
+        (["0000000010.bin", "0000000012.bin"], True),
+        (["scan7.bin"], True),
+    ],
+)
+def test_names_that_are_times_count_no_scans(tmp_path, names, counted):
+    for name in names:
+        (tmp_path / name).touch()
+    assert list_scans(tmp_path, (".bin",)).counted == counted
+
+
 def test_an_absent_folder_holds_no_scans(tmp_path):
     assert len(list_scans(tmp_path / "nowhere", (".bin",))) == 0
 
 
 @pytest.mark.parametrize("name", [name for name in data_groups() if not name.startswith("simulated")])
-def test_a_folder_that_is_closed_to_us_holds_nothing(name, tmp_path, monkeypatch, capsys):
+def test_folders_closed_to_us_and_links_in_a_circle_hold_nothing(name, tmp_path, monkeypatch, capsys):
     """As lost+found is on every disk; a superuser, as whom tests may run, is stopped by no permission."""
     (tmp_path / "lost+found").mkdir()
+    for link in ("circle", "circle.bin", "circle.bag"):
+        (tmp_path / link).symlink_to(link)
 
     def closed(look):
         def looks(path, **options):
@@ -44,11 +74,12 @@ def test_a_folder_that_is_closed_to_us_holds_nothing(name, tmp_path, monkeypatch
         with pytest.raises(SystemExit) as exited:
             main(["check", f"data={name}", f"data.root='{root}'"])
         assert exited.value.code == 1 and "NOT usable" in capsys.readouterr().out
-    assert not len(list_scans(tmp_path / "lost+found", (".bin",)))
+    assert not any(len(list_scans(tmp_path / closed, (".bin",))) for closed in ("lost+found", "circle"))
 
 
 def test_natural_key_orders_by_value_then_by_text():
     assert sorted(["b2", "a10", "a9", "a09"], key=natural_key) == ["a09", "a9", "a10", "b2"]
+    assert sorted(["lot 10²", "②", "lot 9", "①"], key=natural_key) == ["lot 9", "lot 10²", "①", "②"]
 
 
 @pytest.mark.parametrize(
