@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.scan_files import ScanFiles, holds_scans, list_scans, natural_key, subfolders
+from lidarlearn.data.scan_files import ScanFiles, full_path, holds_scans, list_scans, natural_key, subfolders
 from lidarlearn.errors import UserError
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -45,7 +45,7 @@ def find_bags(root: Path) -> dict[str, Path]:
 
 def bag_name(path: Path) -> str:
     """A folder's name, or a file's without its suffix."""
-    return path.stem if _is_file(path) else path.absolute().name
+    return path.stem if _is_file(path) else full_path(path).name
 
 
 def list_files(bag: Path) -> ScanFiles:

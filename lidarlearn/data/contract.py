@@ -14,18 +14,14 @@ def require_poses(name: str, T_world_lidar: object, count: int) -> None:
         return
     what, meaning = f"{name}: T_world_lidar is", "one pose a scan, or None without ground truth"
     poses = _require(what, T_world_lidar, (count, 4, 4), torch.float64, meaning)
-    wrong = ~poses.isfinite().flatten(1).all(dim=1)
-    if bool(wrong.any()):
-        raise UserError(
-            f"{name}: T_world_lidar holds values that are not finite in {int(wrong.sum())} of its {count} poses, first "
-            f"in that of scan {int(wrong.int().argmax())}.\n  change: its reader, to leave out scans without a pose"
-        )
+    _require_finite(f"{name}: T_world_lidar", poses, "pose")
 
 
 def require_timestamps(name: str, timestamps: object, count: int) -> None:
-    """Raise a UserError unless a sequence has a time for each of its scans, or none at all."""
+    """Raise a UserError unless a sequence has a finite time for each of its scans, or none at all."""
     if timestamps is not None:
-        _require(f"{name}: timestamps is", timestamps, (count,), None, "one time [s] a scan, or None")
+        times = _require(f"{name}: timestamps is", timestamps, (count,), None, "one time [s] a scan, or None")
+        _require_finite(f"{name}: timestamps", times[:, None], "time")
 
 
 def require_points(name: str, points: object, times: object) -> None:
@@ -45,6 +41,16 @@ def _require(
             return value
     wanted = f"{_in_words('tensor', dtype)} of {_in_brackets(shape)}"
     raise UserError(f"{what} a {_seen(value)}, not a {wanted}.\n  change: its reader, to give {meaning}")
+
+
+def _require_finite(what: str, values: Tensor, kind: str) -> None:
+    """Of each scan's values, whose first axis it is."""
+    wrong = ~values.isfinite().flatten(1).all(dim=1)
+    if bool(wrong.any()):
+        raise UserError(
+            f"{what} holds values that are not finite in {int(wrong.sum())} of its {len(values)} {kind}s, first in that"
+            f" of scan {int(wrong.int().argmax())}.\n  change: its reader, to leave out scans without a {kind}"
+        )
 
 
 def _seen(value: object) -> str:

@@ -1,6 +1,7 @@
 """A folder of scans from anywhere: .bin, .npy, .pcd or .ply in natural name order, ground truth where there is some.
 
-On disk: either every subfolder with scans in it is a sequence, or the folder itself is one. Beside its scans a sequence
+On disk: either every subfolder with scans in it is a sequence, or the folder itself is one; where both hold scans, the
+subfolders are, and the folder only by its name. Beside its scans a sequence
 may have `times.txt` (a time [s] per scan) and ground truth of the LiDAR's own poses, in KITTI's or TUM's format:
 `poses.txt`, `poses.tum`, `groundtruth.txt` with the scans, or `<sequence>.txt`, `<sequence>.tum` beside its folder.
 KITTI rows belong to the scans in order; TUM rows are interpolated at the scans' times, where scans before or after them
@@ -8,10 +9,11 @@ are left out, or belong to the scans in order where these have no times. Poses r
 scans' times tell the scan period, too, of which the points' times take a share.
 """
 
+import logging
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -20,12 +22,14 @@ from lidarlearn.data.cloud_files import SUFFIXES, as_scan, note_returns, read_cl
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.ground_truth import describe_ground_truth, find_ground_truth, read_ground_truth
 from lidarlearn.data.on_disk import DataSetOnDisk
-from lidarlearn.data.pose_files import read_numbers
-from lidarlearn.data.scan_files import ScanFiles, holds_scans, is_folder, list_scans, subfolders
+from lidarlearn.data.pose_files import read_times
+from lidarlearn.data.scan_files import ScanFiles, full_path, holds_scans, is_folder, list_scans, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
 from lidarlearn.data.sweep_stamps import sweep_clock
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -109,7 +113,7 @@ class Folder(DataSetOnDisk):
         max_intensity: float | int | None = None,
     ) -> None:
         root = Path(root).expanduser()
-        there = find_sequences(root) or (root.absolute().name,)
+        there = find_sequences(root) or (full_path(root).name,)
         train, val, test = (there if n is None else n for n in (train_sequences, val_sequences, test_sequences))
         super().__init__(root, projection, train, val, test, max_frames, deskew, beam_correction_deg)
         self.bin_columns = bin_columns
@@ -144,6 +148,19 @@ class Folder(DataSetOnDisk):
             require_point_times(sequence, str(files.path(0)))
         return sequence
 
+    def sequences(self, names: Iterable[str]) -> dict[str, Sequence]:
+        """Open several sequences; warns of scans that belong to none."""
+        if remark := self._remark_on_others():
+            _log.warning(remark)
+        return super().sequences(names)
+
+    def check(self) -> LayoutReport:
+        """Describe this folder, and scans in it that belong to no sequence."""
+        report = super().check()
+        if remark := self._remark_on_others():
+            report.odd("root", remark)
+        return report
+
     @staticmethod
     def is_root(path: Path) -> bool:
         """Whether it holds scans, or folders of scans."""
@@ -168,6 +185,16 @@ class Folder(DataSetOnDisk):
             layout.describe_rows(report, name, folder / "times.txt", "times", len(scans))
         describe_ground_truth(report, name, find_ground_truth(folder))
 
+    def _remark_on_others(self) -> str | None:
+        """What to say of scans beside folders of scans, where all of these are configured and they are not."""
+        own, others = full_path(self.root).name, list_scans(self.root, SUFFIXES)
+        if not len(others) or own in self.names or not set(find_sequences(self.root)) <= set(self.names):
+            return None
+        return (
+            f"{len(others)} scans in {self.root} itself are left out, as folders in it hold scans, too;"
+            f" 'data.test_sequences=[\"{own}\"]' reads them"
+        )
+
     def _shares_per_unit(self, files: ScanFiles, timestamps: Float[Tensor, "n"] | None) -> float | None:
         """Of the scan period, in a unit of the points' times, by the file amid the recording."""
         if timestamps is None or len(files) < 2 or _kinds(files) not in ([".pcd"], [".ply"]):
@@ -181,20 +208,20 @@ class Folder(DataSetOnDisk):
 
     def _folder(self, name: str) -> Path:
         folder = self.root / name
-        return self.root if name == self.root.absolute().name and not is_folder(folder) else folder
+        return self.root if name == full_path(self.root).name and not is_folder(folder) else folder
 
 
 def find_sequences(root: Path) -> tuple[str, ...]:
     """Names of the subfolders that hold scans; the folder's own name where it holds them itself; else nothing."""
     names = tuple(folder.name for folder in subfolders(root) if holds_scans(folder, SUFFIXES))
-    return names or ((root.absolute().name,) if holds_scans(root, SUFFIXES) else ())
+    return names or ((full_path(root).name,) if holds_scans(root, SUFFIXES) else ())
 
 
 def _timestamps(folder: Path, count: int) -> Float[Tensor, "n"] | None:
     path = folder / "times.txt"
     if not path.is_file():
         return None
-    times = torch.from_numpy(read_numbers(path, columns=1)[:, 0])
+    times = read_times(path)
     if len(times) != count:
         raise DamagedFileError(path, f"{len(times)} times for {count} scans", "give every scan a row")
     return times

@@ -12,6 +12,7 @@ from lidarlearn.data import layout
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.pose_files import read_kitti_poses, read_lines, read_tum_poses, start_at_identity
+from lidarlearn.data.scan_files import full_path
 from lidarlearn.data.sequence import LayoutReport
 
 _INSIDE = ("poses.txt", "poses.tum", "groundtruth.txt")
@@ -89,7 +90,7 @@ def find_ground_truth(recording: Path, name: str | None = None) -> Path | None:
         recording: a folder, in which it may lie, or a file.
         name: of the file beside the recording, without its suffix; None for the recording's own.
     """
-    recording = recording.absolute()
+    recording = full_path(recording)
     inside = [recording / file for file in _INSIDE]
     beside = [recording.with_name(f"{name or recording.name}{suffix}") for suffix in _BESIDE]
     return next((path for path in inside + beside if path.is_file()), None)

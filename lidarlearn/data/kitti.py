@@ -16,7 +16,7 @@ from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.on_disk import DataSetOnDisk
-from lidarlearn.data.pose_files import as_transforms, read_kitti_poses, read_lines, read_numbers, start_at_identity
+from lidarlearn.data.pose_files import as_transforms, read_kitti_poses, read_lines, read_times, start_at_identity
 from lidarlearn.data.scan_files import (
     ScanFiles,
     is_folder,
@@ -161,7 +161,7 @@ class KittiOdometry(DataSetOnDisk):
     def _timestamps(self, path: Path, scans: ScanFiles) -> Float[Tensor, "n"] | None:
         if not path.is_file():
             return None
-        times = torch.from_numpy(read_numbers(path, columns=1)[:, 0])
+        times = read_times(path)
         _require_rows(path, len(times), scans)
         return times[scans.numbers]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarlearn.data.errors import ROOT_REMEDY
-from lidarlearn.data.scan_files import ScanFiles, examples, gaps, is_folder, subfolders
+from lidarlearn.data.scan_files import ScanFiles, examples, full_path, gaps, is_folder, subfolders
 from lidarlearn.data.sequence import LayoutReport
 from lidarlearn.errors import UserError
 
@@ -21,7 +21,7 @@ def find_root(root: Path, is_root: Callable[[Path], bool]) -> Path | None:
         return None
     below = subfolders(root)
     grandchildren = (path for folder in below for path in subfolders(folder))
-    candidates = itertools.chain([root], below, grandchildren, list(root.absolute().parents)[:2])
+    candidates = itertools.chain([root], below, grandchildren, list(full_path(root).parents)[:2])
     return next((path for path in candidates if is_root(path)), None)
 
 
@@ -135,7 +135,7 @@ def suggest_sequences(report: LayoutReport, found: Iterable[str]) -> None:
     """Fill in what to change where some of the configured sequences cannot be used."""
     if report.usable or report.remedy:
         return
-    there = ",".join(found)
+    there = examples(found)
     report.remedy = (
         "complete what is missing, or name only sequences that are there"
         f" ({there or 'none'}) in data.train_sequences, data.val_sequences and data.test_sequences"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lidarlearn.data import layout
 from lidarlearn.data.errors import ROOT_REMEDY, DataSetNotFoundError
-from lidarlearn.data.scan_files import ScanFiles
+from lidarlearn.data.scan_files import ScanFiles, examples
 from lidarlearn.data.sequence import DataSet, LayoutReport
 
 
@@ -63,7 +63,7 @@ class DataSetOnDisk(DataSet):
             remedy = f"wrong folder level, data.root={near} looks right"
         elif found and name not in found:
             remedy = (
-                f"{self.settings_naming(name)} to sequences that are there ({', '.join(found)}),"
+                f"{self.settings_naming(name)} to sequences that are there ({examples(found)}),"
                 " or data.root=/path/to/a/fuller/copy"
             )
         else:

@@ -33,7 +33,7 @@ def read_lines(path: Path) -> list[str]:
         DamagedFileError: absent, or no text.
     """
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DamagedFileError(path, f"cannot be read: {error}") from error
 
@@ -61,6 +61,26 @@ def require_finite(path: Path, rows: NDArray[np.float64]) -> None:
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):
         raise DamagedFileError(path, f"{len(bad)} rows are not finite, the first is row {bad[0] + 1}")
+
+
+def require_ascending(path: Path, times: NDArray[np.float64]) -> None:
+    """Raise DamagedFileError with the number of the first row whose time is not after that of the row before."""
+    late = np.flatnonzero(np.diff(times) <= 0)
+    if len(late):
+        problem = f"time stamps that do not ascend, the first is in row {late[0] + 2}"
+        raise DamagedFileError(path, problem, "give each row a time after that of the row before")
+
+
+def read_times(path: Path) -> Float[Tensor, "n"]:
+    """Times [s], one a row.
+
+    Raises:
+        DamagedFileError: not such a file, not finite, or times that do not ascend.
+    """
+    rows = read_numbers(path, columns=1)
+    require_finite(path, rows)
+    require_ascending(path, rows[:, 0])
+    return torch.from_numpy(rows[:, 0])
 
 
 def read_kitti_poses(path: Path) -> Float[Tensor, "n 4 4"]:
@@ -96,8 +116,7 @@ def stamped_poses(path: Path, rows: NDArray[np.float64]) -> StampedPoses:
     require_finite(path, rows)
     if (np.linalg.norm(rows[:, 4:], axis=1) < 0.5).any():
         raise DamagedFileError(path, "a quaternion that is not of length 1")
-    if (np.diff(rows[:, 0]) <= 0).any():
-        raise DamagedFileError(path, "time stamps that do not ascend")
+    require_ascending(path, rows[:, 0])
     T = as_transforms(torch.from_numpy(np.dstack([Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4, None]])))
     return StampedPoses(torch.from_numpy(rows[:, 0].copy()), T)
 

@@ -138,6 +138,11 @@ def is_folder(path: Path) -> bool:
     return os.path.isdir(path)
 
 
+def full_path(path: Path) -> Path:
+    """Absolute and without `..`: what it ends with is the name of the folder, and its parent the one above."""
+    return Path(os.path.abspath(path))
+
+
 def _entries(folder: Path) -> list["os.DirEntry[str]"]:
     """What a folder holds; nothing where it is absent or closed to us."""
     if not is_folder(folder) or not os.access(folder, os.R_OK):

@@ -30,6 +30,7 @@ BROKEN = {
     "unknown poses": ("T_world_lidar", LOST, "not finite in 2 of its 6 poses, first in that of scan 2"),
     "too few timestamps": ("timestamps", torch.zeros(5), "timestamps is a float32 tensor of (5), not a tensor of (6)"),
     "timestamps in a list": ("timestamps", [0.1] * FRAMES, "timestamps is a list, not a tensor of (6)"),
+    "unknown timestamps": ("timestamps", LOST[:, 0, 3], "not finite in 1 of its 6 times, first in that of scan 2"),
     "points in double precision": ("points", POINTS.double(), f"is a float64 tensor of (50, 3), {SINGLE_3}"),
     "points of numpy": ("points", POINTS.numpy(), f"is a float32 numpy.ndarray of (50, 3), {SINGLE_3}"),
     "four columns": ("points", torch.ones(50, 4), f"is a float32 tensor of (50, 4), {SINGLE_3}"),

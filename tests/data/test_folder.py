@@ -34,6 +34,32 @@ def test_every_subfolder_is_a_sequence(tmp_path):
     assert len(data.sequence("run_9")) == 3
 
 
+def test_scans_beside_folders_of_scans_are_not_left_out_in_silence(tmp_path, caplog):
+    write_scans(tmp_path / "drive")
+    write_scans(tmp_path / "drive" / "maps", ["GlobalMap.bin"])
+    data = folder(tmp_path / "drive")
+    assert data.names == ("maps",) and len(data.sequences(["maps"])) == 1
+    for text in (details(data.check(), "odd"), caplog.text):
+        assert f"3 scans in {tmp_path / 'drive'} itself are left out" in text
+        assert "'data.test_sequences=[\"drive\"]' reads them" in text
+    caplog.clear()
+    chosen = folder(tmp_path / "drive", test_sequences=["drive"])
+    assert len(chosen.sequences(["drive"])["drive"]) == 3
+    assert "left out" not in details(chosen.check(), "odd") + caplog.text
+
+
+def test_a_folder_given_by_dots_has_its_own_name(tmp_path, monkeypatch):
+    write_scans(tmp_path / "drive")
+    (tmp_path / "drive" / "notes" / "more").mkdir(parents=True)
+    (tmp_path / "drive.txt").write_text(kitti_rows(curve(3)))
+    monkeypatch.chdir(tmp_path / "drive" / "notes")
+    data = folder("..")
+    assert data.names == ("drive",) and data.check().usable
+    assert data.sequence("drive").T_world_lidar is not None
+    monkeypatch.chdir(tmp_path / "drive" / "notes" / "more")
+    assert folder("..").check().remedy == f"data.root={tmp_path / 'drive'}"
+
+
 def test_the_folder_itself_is_a_sequence_in_natural_order(tmp_path):
     write_scans(tmp_path / "drive")
     data = folder(tmp_path / "drive")
@@ -117,6 +143,7 @@ def test_tum_ground_truth_in_order_where_scans_have_no_times(tmp_path):
         ("times.txt", "0\n1\n2\n3\n4\n", "5 times for 3 scans"),
         ("times.txt", "0\n1\n", "2 times for 3 scans"),
         ("times.txt", "", "empty"),
+        ("times.txt", "0\n2\n1\n", "do not ascend"),
     ],
 )
 def test_damaged_ground_truth_and_times(tmp_path, file, content, problem):
@@ -162,6 +189,15 @@ def test_missing_scans(tmp_path):
     (tmp_path / "deep" / "er").mkdir(parents=True)
     write_scans(tmp_path / "deep" / "er" / "drive")
     assert folder(tmp_path).check().remedy == f"data.root={tmp_path / 'deep' / 'er'}"
+
+
+def test_of_many_sequences_a_few_are_named(tmp_path):
+    for i in range(9):
+        write_scans(tmp_path / f"run {i}")
+    with pytest.raises(DataSetNotFoundError, match=r"\(run 0, run 1, run 2, run 3, run 4, \.\.\.\)"):
+        folder(tmp_path, test_sequences=["x"]).sequence("x")
+    remedy = folder(tmp_path, test_sequences=["x"]).check().remedy
+    assert "run 4" in remedy and "run 5" not in remedy
 
 
 def test_check(tmp_path):

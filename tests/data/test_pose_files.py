@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import interpolate_poses
-from lidarlearn.data.pose_files import read_kitti_poses, read_tum_poses, start_at_identity
+from lidarlearn.data.pose_files import read_kitti_poses, read_times, read_tum_poses, start_at_identity
 from tests.data.writers import curve, kitti_rows
 
 
@@ -30,6 +30,26 @@ def test_tum_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
+        ("0\n# a blank, and a comment\n\n0.1\nnan\n", "1 rows are not finite, the first is row 3"),
+        ("0\n0.1\n0.1\n0.2\n", r"do not ascend, the first is in row 3(.|\n)*after that of the row before"),
+        ("0\n0.2\n0.1\n0.3\n", "do not ascend, the first is in row 3"),
+    ],
+)
+def test_damaged_times(tmp_path, content, problem):
+    (tmp_path / "times.txt").write_text(content)
+    with pytest.raises(DamagedFileError, match=problem):
+        read_times(tmp_path / "times.txt")
+
+
+def test_a_byte_order_mark_is_no_number(tmp_path):
+    """Editors on Windows begin a file with one."""
+    (tmp_path / "times.txt").write_text("0.5\n1\n", encoding="utf-8-sig")
+    assert read_times(tmp_path / "times.txt").tolist() == [0.5, 1]
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
         ("", "empty"),
         ("1 2 3\n", "3 numbers"),
         ("a b c\n", "not a table"),
@@ -46,7 +66,7 @@ def test_damaged_kitti_poses(tmp_path, content, problem):
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        (tum_rows(curve(3), [1.0, 3.0, 2.0]), "ascend"),
+        (tum_rows(curve(3), [1.0, 3.0, 2.0]), "ascend, the first is in row 3"),
         ("1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 1\n", "quaternion"),
     ],
 )

@@ -95,6 +95,9 @@ def test_the_root_may_be_one_bag(tmp_path, kind, monkeypatch):
         assert len(rosbag(storage).sequence("2024.05.01")) == 2  # without the metadata
         monkeypatch.chdir(path)
         assert len(rosbag(".").sequence("2024.05.01")) == 2
+        (path / "notes").mkdir()
+        monkeypatch.chdir(path / "notes")
+        assert rosbag("..").names == ("2024.05.01",)
 
 
 def test_a_folder_of_parts_is_one_recording(tmp_path):
