@@ -5,6 +5,7 @@ such files: the parts into which a recorder has split one recording.
 """
 
 import os
+import re
 from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -26,6 +27,10 @@ _REPAIR = (
     "copy or download it again, or repair what a recorder left unfinished: `rosbag reindex BAG`,"
     " `ros2 bag reindex FOLDER`, `mcap recover FILE`"
 )
+_NO_DAMAGE = {  # what to change instead, by the library's words
+    "Unrecognized storage format": "the name of the file, to a suffix in small letters",
+    "Profile is not ros2": "data.root to the .bag from which it was converted: an .mcap of ROS 1 is not read",
+}
 
 
 def find_bags(root: Path) -> dict[str, Path]:
@@ -254,4 +259,11 @@ def _readable(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # the library's own, its assertions, those of struct, of SQLite and of decompressors
         lines = str(error).splitlines() or [type(error).__name__]
-        raise DamagedFileError(path, f"cannot be read as a ROS bag ({lines[0].rstrip('.')})", _REPAIR) from error
+        problem = f"cannot be read as a ROS bag ({lines[0].rstrip('.')})"
+        raise DamagedFileError(path, problem, _remedy(path, problem)) from error
+
+
+def _remedy(path: Path, problem: str) -> str:
+    if "unable to open database file" in problem and re.search(r"[#?]|%[0-9a-fA-F]{2}", str(path)):
+        return "the names in its path that hold #, ? or %: the library rosbags finds no .db3 there"
+    return next((remedy for words, remedy in _NO_DAMAGE.items() if words in problem), _REPAIR)

@@ -279,6 +279,29 @@ def test_a_bag_from_before_bags_held_definitions_of_their_messages(tmp_path):
     assert [len(scan.points) for scan in rosbag(tmp_path).sequence("street")] == [200] * 3
 
 
+@pytest.mark.parametrize("folder", ["run #1", "what? yes", "50%25"])
+def test_a_database_that_the_library_does_not_find_is_not_called_damaged(tmp_path, folder):
+    write_bag(tmp_path, "street", {"/points": plain()}, "sqlite3")
+    (tmp_path / "street").rename(tmp_path / folder)
+    with pytest.raises(DamagedFileError, match=r"change: the names in its path that hold #, \? or %"):
+        rosbag(tmp_path).sequence(folder)
+
+
+@pytest.mark.parametrize("suffix", ["DB3", "MCAP"])
+def test_suffixes_in_capitals_are_to_be_renamed(tmp_path, suffix):
+    path = write_bag(tmp_path, "street", {"/points": plain()}, {"DB3": "sqlite3", "MCAP": "mcap"}[suffix])
+    (path / f"street.{suffix.lower()}").rename(tmp_path / f"S.{suffix}")
+    with pytest.raises(DamagedFileError, match=r"S\.(.|\n)*a suffix in small letters"):
+        rosbag(tmp_path / f"S.{suffix}").sequence("S")
+
+
+def test_an_mcap_of_ros_1_is_not_called_damaged(tmp_path):
+    file = write_bag(tmp_path, "street", {"/points": plain()}, "mcap") / "street.mcap"
+    file.write_bytes(file.read_bytes().replace(b"ros2", b"ros1", 1))  # the header's profile
+    with pytest.raises(DamagedFileError, match=r"change: data\.root to the \.bag from which it was converted"):
+        rosbag(tmp_path).sequence("street")
+
+
 def test_missing_storage(tmp_path):
     path = write_bag(tmp_path, "street", {"/points": plain()}, "mcap")
     (path / "street.mcap").unlink()
