@@ -57,12 +57,12 @@ def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
     """Read a scan in the format that its name says.
 
     Args:
-        path: .bin (float32 rows x, y, z, intensity, ...), .npy (the same as an array), .pcd or .ply.
+        path: .bin (float32 rows x, y, z, intensity, ...), .npy (the same as an array, or named fields), .pcd or .ply.
         bin_columns: numbers per point of a .bin file: 4 as in KITTI, 5 as in nuScenes.
 
     Raises:
-        DamagedFileError: not such a file, no point in it, or (.bin and .npy) a point that is not finite. In .pcd and
-            .ply that is a common way to say "no return".
+        DamagedFileError: not such a file, no point in it, or (.bin, and .npy without names) a point that is not finite.
+            In the others that is a common way to say "no return".
     """
     match path.suffix.lower():
         case ".bin":
@@ -178,6 +178,8 @@ def _read_npy(path: Path) -> dict[str, NDArray[Any]]:
         rows = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise DamagedFileError(path, f"no array of numbers ({error})") from error
+    if rows.dtype.names is not None:
+        return {name.lower(): rows[name].reshape(-1) for name in rows.dtype.names}
     if rows.ndim != 2 or rows.shape[1] < 3 or rows.dtype.kind not in "fiu":
         raise DamagedFileError(path, f"an array {rows.shape} of {rows.dtype}, not (n, 3 or more) numbers")
     if not np.isfinite(rows[:, :4]).all():

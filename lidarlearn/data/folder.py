@@ -161,6 +161,13 @@ class Folder(DataSetOnDisk):
             report.odd("root", remark)
         return report
 
+    def view_remark(self, name: str, points: Float[Tensor, "n 3"]) -> str | None:
+        """As of any data set; of .bin files it may also be that their columns are others."""
+        remark = super().view_remark(name, points)
+        if remark is None or _kinds(list_scans(self._folder(name), SUFFIXES)) != [".bin"]:
+            return remark
+        return f"{remark},\n  or data.bin_columns where these files do not have {self.bin_columns} numbers to a point"
+
     @staticmethod
     def is_root(path: Path) -> bool:
         """Whether it holds scans, or folders of scans."""
@@ -197,7 +204,7 @@ class Folder(DataSetOnDisk):
 
     def _shares_per_unit(self, files: ScanFiles, timestamps: Float[Tensor, "n"] | None) -> float | None:
         """Of the scan period, in a unit of the points' times, by the file amid the recording."""
-        if timestamps is None or len(files) < 2 or _kinds(files) not in ([".pcd"], [".ply"]):
+        if timestamps is None or len(files) < 2 or _kinds(files) not in ([".npy"], [".pcd"], [".ply"]):
             return None
         period_s = float(timestamps.diff().median())
         try:

@@ -219,7 +219,7 @@ class DataSet(ABC):
         first = {name: sequence.first_returns() for name, sequence in opened.items()}
         for name, sequence in opened.items():
             sequence.require_contract(first[name])
-        remarks = (view_remark(name, scan.points, self.projection) for name, scan in first.items())
+        remarks = (self.view_remark(name, scan.points) for name, scan in first.items())
         if remark := next(filter(None, remarks), None):
             _log.warning(remark)
         return opened
@@ -252,12 +252,16 @@ class DataSet(ABC):
                 scan = next(iter(sequence), None) or sequence.first_returns()  # which tells that there is none
                 sequence.require_contract(scan)
                 points = scan.points
-                remark = view_remark(name, points, self.projection) if len(points) else "its first scan has no return"
+                remark = self.view_remark(name, points) if len(points) else "its first scan has no return"
             except UserError as problem:
                 report.missing(name, one_line(problem))
             else:
                 if remark is not None:
                     report.odd(name, one_line(remark))
+
+    def view_remark(self, name: str, points: Float[Tensor, "n 3"]) -> str | None:
+        """What to say where many points of a sequence's first scan miss the image; None where they do not."""
+        return view_remark(name, points, self.projection)
 
     def open_for_check(self, name: str) -> Sequence:
         """Open a sequence as far as a check can wait for it."""

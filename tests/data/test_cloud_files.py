@@ -39,6 +39,20 @@ def test_bin_and_npy_round_trip(tmp_path, columns):
         assert cloud.times is None
 
 
+@pytest.mark.parametrize("shape", [(200,), (4, 50)])
+def test_npy_of_named_fields(tmp_path, shape):
+    points = random_points(0)
+    points[3] = np.nan
+    fields = [("X", ">f8"), ("y", "<f4"), ("z", "<f4"), ("ring", "u1"), ("intensity", "u1"), ("t", "<u4")]
+    rows = np.zeros(200, fields)
+    rows["X"], rows["y"], rows["z"] = points.T
+    rows["intensity"], rows["t"] = 7, TIMES
+    np.save(tmp_path / "0.npy", rows.reshape(shape))
+    cloud = read_cloud(tmp_path / "0.npy")
+    assert np.array_equal(cloud.points, np.delete(points, 3, axis=0))
+    assert np.array_equal(cloud.times, np.delete(TIMES, 3)) and (cloud.intensities == 7).all()
+
+
 @pytest.mark.parametrize("suffix", [".pcd", ".ply"])
 def test_points_that_stand_for_no_return_are_left_out_with_their_fields(tmp_path, suffix):
     points = random_points(0)
@@ -153,7 +167,14 @@ def test_text_with_too_few_points_is_truncated(tmp_path):
 
 @pytest.mark.parametrize(
     "rows",
-    [np.zeros((0, 4)), np.full((4, 4), np.nan), np.zeros((4, 2)), np.zeros(5), np.array(["a"] * 4)],
+    [
+        np.zeros((0, 4)),
+        np.full((4, 4), np.nan),
+        np.zeros((4, 2)),
+        np.zeros(5),
+        np.array(["a"] * 4),
+        np.zeros(4, [("u", "f4")]),
+    ],
 )
 def test_npy_without_points(tmp_path, rows):
     np.save(tmp_path / "scan.npy", rows)

@@ -6,7 +6,7 @@ from lidarlearn.data.folder import Folder
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 from tests.data.test_pose_files import tum_rows
-from tests.data.writers import curve, kitti_rows, random_points, write_float32, write_pcd
+from tests.data.writers import as_rows, curve, kitti_rows, random_points, write_float32, write_pcd
 
 TIMES = np.linspace(0, 99_000_000, 200).astype(np.uint32)
 
@@ -89,6 +89,30 @@ def test_scan_times_tell_what_share_of_a_period_the_points_take(tmp_path, stamps
         (tmp_path / "drive" / "times.txt").write_text(stamps)
     times = folder(tmp_path, deskew=True).sequence("drive").scan(1).times
     assert times is not None and np.allclose(times, share * np.linspace(-0.5, 0.5, 200), atol=1e-6)
+
+
+def test_npy_of_named_fields_has_its_share_of_the_period_too(tmp_path):
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "times.txt").write_text("0\n0.2\n")
+    for i in range(2):
+        rows = as_rows(random_points(i), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")], t=TIMES)
+        np.save(tmp_path / "drive" / f"{i}.npy", rows)
+    times = folder(tmp_path, deskew=True).sequence("drive").scan(1).times
+    assert np.allclose(times, 0.495 * np.linspace(-0.5, 0.5, 200), atol=1e-6)
+
+
+def test_points_off_the_image_may_be_read_in_wrong_columns(tmp_path):
+    """nuScenes' files have a fifth number to a point, its ring."""
+    points = random_points(0)
+    points[:, 2] = -np.abs(points[:, 2])
+    (tmp_path / "bin").mkdir()
+    np.column_stack([points, np.ones(200), np.arange(200) % 32]).astype("<f4").tofile(tmp_path / "bin" / "0.pcd.bin")
+    (tmp_path / "npy").mkdir()
+    np.save(tmp_path / "npy" / "0.npy", points[:, [0, 2, 1]])
+    odd = details(folder(tmp_path).check(), "odd").split(" | ")
+    of_bin, of_npy = (line for line in odd if "outside the image" in line)
+    assert "data.bin_columns where these files do not have 4 numbers" in of_bin and "bin_columns" not in of_npy
+    assert "outside the image" not in details(folder(tmp_path / "bin", bin_columns=5).check(), "odd")
 
 
 def test_deskewing_needs_point_times(tmp_path):
