@@ -1,4 +1,4 @@
-"""Surface normals from the moments of neighbouring points: in a vertex map, or in any neighbourhood of a map."""
+"""Surface normals from the moments of neighbouring points: in a vertex map, or anywhere else."""
 
 from dataclasses import dataclass
 
@@ -15,11 +15,11 @@ _Vector = tuple[Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True)
 class PlaneFit:
-    """Planes through sets of points, from their covariances.
+    """Least-squares planes through sets of points.
 
     Args:
-        normals: unit vectors of the smallest eigenvalue, sign arbitrary.
-        variances: the three eigenvalues in ascending order [m^2]: across the plane, then along it.
+        normals: unit eigenvectors with the smallest eigenvalue, of arbitrary sign.
+        variances: the three eigenvalues of the covariance in ascending order [m^2]: across the plane, then along it.
     """
 
     normals: Float[Tensor, "*batch 3"]
@@ -27,19 +27,19 @@ class PlaneFit:
 
 
 def fit_planes(covariances: Float[Tensor, "*batch 6"]) -> PlaneFit:
-    """Least-squares planes from covariances given by their components (xx, xy, xz, yy, yz, zz).
+    """Least-squares planes from the components (xx, xy, xz, yy, yz, zz) of covariances.
 
-    Closed form and branch-free, so it runs at memory speed on both devices where a batched eigensolver does not: the
-    adjugate has the same eigenvectors with eigenvalues l1 l2 >> l0 l2 >= l0 l1, so a few squarings leave the normal
-    alone. The error is (l0 / l1)^8: nothing for a plane, and a set without a plane has no normal to be wrong about.
-    Components are kept apart: fastest where they lie apart in memory, too, and what a compiler can fuse into one pass.
+    In closed form and without branches, so it runs at memory speed on CPU and GPU; a batched eigensolver does not. The
+    adjugate has the same eigenvectors with the eigenvalues l1 l2 >> l0 l2 >= l0 l1, so after squaring it a few times
+    only the normal is left. The error is (l0 / l1)^8, negligible for a plane. Components are separate tensors, fastest
+    if each is contiguous in memory, and fused into one pass by a compiler.
     """
     normal, variances = _fit(covariances.unbind(-1))
     return PlaneFit(torch.stack(normal).movedim(0, -1), torch.stack(variances).movedim(0, -1))
 
 
 def _fit(s: _Symmetric) -> tuple[_Vector, _Vector]:
-    """Normals and variances by their components, see `fit_planes`."""
+    """Components of the normals and variances, see `fit_planes`."""
     tiny = torch.finfo(s[0].dtype).tiny
     scale = (s[0] + s[3] + s[5]).clamp(min=tiny)
     s = tuple(component / scale for component in s)
@@ -70,16 +70,16 @@ def normal_map(
 ) -> Float[Tensor, "*batch 3 h w"]:
     """Unit normals from the activated pixels around each pixel, pointing towards the sensor, zeros where undefined.
 
-    Moments are taken relative to the pixel's own point, so float32 loses nothing at long range. A normal needs four
-    neighbours, some of them in other rows and some in other columns (a single line of points lies in any plane), and
-    no depth jump among those used.
+    Moments are relative to the pixel's own point, so that float32 is exact enough at long range. A normal needs four
+    neighbours without a depth jump, some in other rows and some in other columns: a single line of points lies in many
+    planes.
 
     Args:
         vertex_map: points [m] in the sensor frame, zeros where no point fell.
         window: rows and columns of the neighbourhood [px], odd; columns wrap at the seam.
-        max_range_jump: neighbours count if their range differs by less than this share of the pixel's own range.
-        max_roughness: largest accepted ratio of the deviation from the plane to the patch's smaller extent in it;
-            generous, because poles and trunks are no planes but hold a car's motion along the road.
+        max_range_jump: neighbours are used if their range differs by less than this share of the pixel's own range.
+        max_roughness: largest accepted deviation from the plane, relative to the smaller extent in it. Generous: poles
+            and trunks are no planes, but they determine a car's motion along the road.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood".
     """
@@ -101,14 +101,14 @@ def normal_map(
 
 @dataclass(frozen=True)
 class _Moments:
-    """Sums over the used neighbours of each pixel, of their offsets from its own point.
+    """Moments of the used neighbours of each pixel, relative to its own point.
 
     Args:
-        counts: how many lie in the same row, in the same column, and in neither.
-        first: of the offsets x, y, z.
-        squares: of xx, yy, zz.
-        xy_xz: of xy, xz.
-        yz: of yz.
+        counts: number of neighbours in the same row, in the same column, and in neither.
+        first: sums of x, y, z.
+        squares: sums of xx, yy, zz.
+        xy_xz: sums of xy, xz.
+        yz: sum of yz.
     """
 
     counts: list[Float[Tensor, "*batch h w"]]
@@ -124,10 +124,10 @@ def _window_moments(
     rows, columns = window[0] // 2, window[1] // 2
     h, w = channels.shape[-2:]
     ranges = squared_ranges(channels.movedim(0, -1)).sqrt_()
-    ranges = torch.where(ranges > 0, ranges, torch.inf)  # an empty pixel is near to nothing, not even to another one
+    ranges = torch.where(ranges > 0, ranges, torch.inf)  # an empty pixel is near no other, empty or not
     neighbours, neighbours_ranges = _padded(channels, rows, columns, 0.0), _padded(ranges, rows, columns, torch.inf)
     tolerance = max_range_jump * ranges
-    # Sums that are added to in part are tensors of their own: what adds to a part of one, a compiler copies whole.
+    # Separate tensors: for an in-place sum into a part of a tensor, a compiler copies all of it.
     counts, yz = [torch.zeros_like(ranges) for _ in range(3)], torch.zeros_like(ranges)
     first, squares, xy_xz = (torch.zeros_like(part) for part in (channels, channels, channels[1:]))
     for row in range(2 * rows + 1):
@@ -148,7 +148,7 @@ def _window_moments(
 def _padded(
     images: Float[Tensor, "*channels h w"], rows: int, columns: int, value: float
 ) -> Float[Tensor, "*channels padded_h padded_w"]:
-    """Rows of a value above and below, columns from the other side of the seam."""
+    """Pad with a value above and below, and with the columns from the other side of the seam at the sides."""
     wrapped = torch.cat([images[..., images.shape[-1] - columns :], images, images[..., :columns]], dim=-1)
     return pad(wrapped, (0, 0, rows, rows), value=value)
 
@@ -185,7 +185,7 @@ def _multiply(s: _Symmetric, v: _Vector) -> _Vector:
 
 
 def _longest_column(s: _Symmetric) -> _Vector:
-    """The column with the largest diagonal element, of matrices of rank one."""
+    """The column with the largest diagonal element; of a matrix of rank one it is the longest."""
     xx, xy, xz, yy, yz, zz = s
     x_longest, y_longest = (xx >= yy) & (xx >= zz), yy >= zz
     return (

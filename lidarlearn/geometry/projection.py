@@ -42,11 +42,11 @@ class SphericalProjection:
         return self.height * self.width
 
     def pixel_index(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch n"]:
-        """Each point's pixel, row * width + column in 32 bits; -1 outside the field of view, at the origin, for NaN.
+        """The pixel of each point, row * width + column as int32; -1 outside the field of view, at the origin, for NaN.
 
-        Infinite points are not looked for: odometries and readers leave them out before.
+        Infinite points are not handled: odometries and readers leave them out.
         """
-        # Coordinates apart, in place, in 32 bits: a map of a million points is projected at the speed of the memory.
+        # Axis by axis, in place, in 32 bits: a map of a million points is projected at memory speed.
         x, y, z = coordinates = points.detach().movedim(-1, 0).contiguous()
         ranges = squared_ranges(coordinates.movedim(0, -1)).sqrt_()
         column = torch.atan2(y, x).mul_(-self.width / (2 * math.pi)).add_(self.width / 2).int()
@@ -58,7 +58,7 @@ class SphericalProjection:
 
     def nearest_points(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch h w"]:
         """Index into `points` of the nearest point of each pixel, -1 where no point fell; see `nearest_per_bin`."""
-        # One bin more, in front, for the points that fall into no pixel.
+        # One bin more, in front, for points outside the image.
         bins = self.pixel_index(points).add_(1)
         index = nearest_per_bin(bins, squared_ranges(points.detach().float()), self.pixels + 1)[..., 1:].long()
         return index.unflatten(-1, (self.height, self.width))
@@ -76,17 +76,17 @@ class SphericalProjection:
 def nearest_per_bin(
     bins: Int[Tensor, "*batch n"], ranges: Float[Tensor, "*batch n"], count: int
 ) -> Int[Tensor, "*batch count"]:
-    """Index of the point with the smallest range among those of each bin, -1 where there are none; 32 bits.
+    """Index of the point with the smallest range in each bin, -1 in empty bins; int32.
 
-    Deterministic on every device: the minimum of (range, index) packed into one integer wins, so equal ranges go to
-    the smaller index, whatever the order of execution.
+    Deterministic on every device, whatever the order of execution: the minimum of (range, index), packed into one
+    integer, wins, so of equal ranges the smaller index does.
 
     Args:
-        bins: of each point, from 0 to `count` - 1.
-        ranges: of each point, not negative; its square will do.
+        bins: bin of each point, from 0 to `count` - 1.
+        ranges: range of each point, or its square; not negative.
         count: number of bins.
     """
-    # non-negative floats are ordered like their bits
+    # Non-negative floats are ordered like their bits.
     keys = ranges.view(torch.int32).long().bitwise_left_shift_(32)
     keys += torch.arange(ranges.shape[-1], device=ranges.device)
     nearest = torch.full((*ranges.shape[:-1], count), _NO_POINT, device=ranges.device)
@@ -94,7 +94,7 @@ def nearest_per_bin(
 
 
 def activated(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Bool[Tensor, "*batch h w"]:
-    """Pixels into which a point fell. Invalid pixels are exact zeros in all three coordinates."""
+    """Pixels into which a point fell. Empty pixels are exact zeros in all three coordinates."""
     return (vertex_map != 0).any(dim=-3)
 
 

@@ -7,14 +7,14 @@ from torch import Tensor
 def squared_ranges(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """Squares of the distances from the origin [m^2].
 
-    Summed axis by axis, several times as fast as a reduction over three coordinates, above all where they lie apart in
-    memory.
+    Summed axis by axis: several times as fast as a reduction over the last dimension, most of all where each axis is
+    contiguous.
     """
     x, y, z = points.unbind(-1)
     return (x * x).addcmul_(y, y).addcmul_(z, z)
 
 
 def in_range(points: Float[Tensor, "n 3"], min_range_m: float, max_range_m: float) -> Int[Tensor, "m"]:
-    """Indices of the points that are so far from the origin [m], none of those that are not finite."""
+    """Indices of the points whose distance from the origin is between two bounds [m]; infinite and NaN are left out."""
     ranges = squared_ranges(points).sqrt_()
     return ((ranges >= min_range_m) & (ranges <= max_range_m)).nonzero()[:, 0]

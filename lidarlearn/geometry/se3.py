@@ -39,10 +39,10 @@ def inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
 
 
 def orthonormalize(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """The nearest transform whose rotation part is orthonormal: a proper rotation, if it nearly was one.
+    """The nearest transform with an orthonormal rotation part; a proper rotation if it nearly was one.
 
-    Products of poses drift from SO(3) by rounding, and a constant-velocity prediction, in which each pose stands
-    twice, doubles that drift with every frame: a trajectory must be brought back as it grows.
+    Products of poses drift from SO(3) by rounding. Constant velocity uses each pose twice, which doubles the drift with
+    every frame, so poses are orthonormalized as a trajectory grows.
     """
     U, _, Vh = torch.linalg.svd(T[..., :3, :3])
     T = T.clone()
@@ -51,9 +51,9 @@ def orthonormalize(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"
 
 
 def transform(T_target_source: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch n 3"]) -> Tensor:
-    """Points in the target frame, in the dtype and on the device of the points.
+    """Points in the target frame, computed in the dtype and on the device of the points.
 
-    The product is taken there, too: cheap for a scan of float32 points on a GPU under a float64 pose on the CPU.
+    The pose may have others: a float64 pose on the CPU moves float32 points on a GPU.
     """
     T = T_target_source.to(points)
     return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
@@ -62,9 +62,9 @@ def transform(T_target_source: Float[Tensor, "*#batch 4 4"], points: Float[Tenso
 def transform_map(
     T_target_source: Float[Tensor, "*#batch 4 4"], vertex_map: Float[Tensor, "*#batch 3 h w"]
 ) -> Float[Tensor, "*batch 3 h w"]:
-    """The points of vertex maps in the target frame, those of empty pixels, too.
+    """The points of vertex maps in the target frame; empty pixels are transformed like points.
 
-    Written out where `transform` multiplies matrices: a compiler fuses it, and its gradient, with what is around.
+    Written out instead of a matrix product, so that a compiler fuses it and its gradient with the code around.
     """
     x, y, z = vertex_map.unsqueeze(-4).unbind(-3)
     T = T_target_source[..., :3, :, None, None].to(vertex_map)
@@ -136,9 +136,9 @@ class MotionDifference:
 
 
 def motion_difference(T_a: Float[Tensor, "4 4"], T_b: Float[Tensor, "4 4"]) -> MotionDifference:
-    """The motion that remains between two motions.
+    """Distance and angle of the transform between two poses or motions, float64 on the CPU.
 
-    In numpy, which takes a fraction of torch's time for one matrix: a GPU waits meanwhile.
+    In numpy, which takes a fraction of torch's time for a single matrix.
     """
     T_a_b = np.linalg.solve(T_a.numpy(), T_b.numpy())
     R, t = T_a_b[:3, :3], T_a_b[:3, 3]
@@ -184,7 +184,7 @@ def accumulate(T_relative: Float[Tensor, "m 4 4"]) -> Float[Tensor, "n 4 4"]:
 
 
 def _twice_sine_axis(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """The axis of a rotation, twice as long as the sine of its angle."""
+    """The axis of a rotation with a length of twice the sine of its angle."""
     twice = R - R.mT
     return torch.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], dim=-1)
 

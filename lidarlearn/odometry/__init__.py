@@ -1,6 +1,6 @@
 """Odometries: an initialization and a registration backend, fed scan by scan.
 
-Poses are float64 on the CPU, where six unknowns are solved fastest; points are float32 on the odometry's device.
+Poses are float64 on the CPU, where six unknowns are solved fastest; points are float32 on the device of the odometry.
 """
 
 from lidarlearn.odometry.backend import Backend

@@ -1,4 +1,4 @@
-"""One registration of a scan: the guess from which it began, where it ended, and what raises doubt about it."""
+"""One registration of a scan: the guess it starts from, its result, and what raises doubt about it."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Guess:
 
     Args:
         T_previous_new: the motion.
-        source: who made the guess; for the health record alone.
+        source: where the guess comes from; only shown in the health record.
         error_m: how far points may be from where the guess puts them [m].
     """
 
@@ -34,9 +34,9 @@ class Attempt:
         guess: the guess.
         result: the registration.
         T_previous_new: the motion that it gives.
-        deviation: between that motion and constant velocity.
+        deviation: difference between that motion and constant velocity.
         is_implausible: whether the deviation is more than a vehicle can do in one scan.
-        is_degenerate: whether the scan says too little about one direction for the motion in it to be relied on.
+        is_degenerate: whether there is too little information along one direction to rely on the motion along it.
     """
 
     guess: Guess
@@ -47,12 +47,12 @@ class Attempt:
     is_degenerate: bool
 
     def health(self, frame: int, points: int, status: Status) -> Health:
-        """The health record of a frame whose pose comes from this registration, or does not as it was refused.
+        """The health record of a frame, if this is its last attempt.
 
         Args:
             frame: index of the scan.
-            points: how many points were registered.
-            status: what became of the registration.
+            points: number of points to register.
+            status: what became of the attempt.
         """
         result = self.result
         return Health(

@@ -17,7 +17,7 @@ from lidarlearn.registration.association.voxel_map import neighbourhood_normals
 from lidarlearn.registration.gauss_newton import GaussNewton
 from lidarlearn.registration.result import RegistrationResult
 
-# Enough to compare hypotheses: the best one is registered again.
+# Coarse, as hypotheses are only compared: the best one is registered again.
 _HYPOTHESIS_ITERATIONS = 20
 _HYPOTHESIS_TOLERANCE = 10  # times the registration's
 _HYPOTHESIS_ROUNDS = 2  # of deskewing
@@ -30,11 +30,11 @@ class Backend:
     Args:
         sampling: which points are used.
         local_map: the scans to register against.
-        registration: how.
-        max_search_distance_m: widest search, when the motion surprises [m].
-        hypothesis_points: points with which several initial poses are tried at once, and compared.
-        hypothesis_distance_m: search distance of each of them [m]. Wider than they are apart, so that none is missed;
-            not much wider, or projective association pulls all of them to rest on a motorway.
+        registration: how scans are registered.
+        max_search_distance_m: widest search distance, used where the error of a guess may be large [m].
+        hypothesis_points: number of points with which hypotheses, several initial poses, are tried and compared.
+        hypothesis_distance_m: search distance of hypotheses [m]. Wider than the distance between them, so that no pose
+            is missed; but not much wider, or projective association pulls all of them to rest on a motorway.
     """
 
     sampling: Sampling
@@ -59,8 +59,8 @@ class Backend:
     ) -> RegistrationResult:
         """Register a scan from one guess of its motion.
 
-        Where points carry times they are deskewed by the guess and, once registered, by the motion that came out: from
-        there the scan is registered again. On a swinging Segway the error of the motion halves.
+        Points with times are deskewed by the guess. After the registration they are deskewed by its result, and
+        registered again from there. On a swinging Segway this halves the error of the motion.
 
         Args:
             scan: the new scan.
@@ -95,17 +95,17 @@ class Backend:
     def register_hypotheses(
         self, scan: SampledScan, T_previous_new: Float[Tensor, "h 4 4"], T_world_previous: Tensor, deskews: bool = True
     ) -> tuple[Float[Tensor, "h 4 4"], Float[Tensor, "h"]]:
-        """Where a few points of the scan go from each of several guesses, and how well they come to agree with the map.
+        """Register a few points of the scan from each of several guesses.
 
         Args:
             scan: the new scan.
             T_previous_new: the guesses.
             T_world_previous: pose of the previous scan.
-            deskews: whether points that carry times are deskewed by each guess, and once more by the motion that comes
-                out: a scan of a sudden turn fits nowhere as it is.
+            deskews: whether points with times are deskewed by each guess, and again by the motion registered from it: a
+                scan of a sudden turn fits nowhere as measured.
 
         Returns:
-            A motion from each guess, and its agreement, see `GaussNewton.agreement`.
+            The motion registered from each guess, and its agreement, see `GaussNewton.agreement`.
         """
         chosen = scan.queries[:: max(math.ceil(len(scan.queries) / self.hypothesis_points), 1)]
         points, normals = scan.points[chosen], self.normals(scan.points, chosen)
@@ -127,7 +127,7 @@ class Backend:
         T_previous_new: Float[Tensor, "*batch 4 4"],
         T_world_previous: Tensor,
     ) -> Float[Tensor, "*batch 4 4"]:
-        """Motions that some points come to from one or several guesses."""
+        """Register some points, coarsely, from one or several guesses of the motion."""
         quick = replace(
             self.registration,
             max_iterations=_HYPOTHESIS_ITERATIONS,
@@ -139,7 +139,7 @@ class Backend:
         return se3.orthonormalize(torch.linalg.solve(T_world_previous, result.T_world_lidar))
 
     def agreement(self, scan: SampledScan, T_previous_new: Tensor, T_world_previous: Tensor) -> float:
-        """How well a motion agrees with the map, see `GaussNewton.agreement`."""
+        """Agreement of a motion with the map, see `GaussNewton.agreement`."""
         points = scan.deskewed(T_previous_new)
         normals = self.normals(points, scan.queries)
         return self._agreement(points[scan.queries], normals, T_world_previous @ T_previous_new).item()
@@ -149,7 +149,7 @@ class Backend:
         return self.registration.agreement(points, association, T_world_lidar, distance_m, normals)
 
     def normals(self, points: Float[Tensor, "n 3"], chosen: Int[Tensor, "m"]) -> Float[Tensor, "m 3"] | None:
-        """Normals of some of a scan's points, from the neighbourhoods among all, where the residual needs them."""
+        """Normals of the chosen points, from their neighbours among all points; None if the residual needs none."""
         if not self.registration.residual.needs_normals:
             return None
         return neighbourhood_normals(points, self.sampling.neighbourhood_m)[chosen]

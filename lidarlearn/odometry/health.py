@@ -11,28 +11,30 @@ Status = Literal["ok", "recovered", "coasted", "restarted"]
 
 @dataclass(frozen=True)
 class Health:
-    """What is known about the registration of one scan; None where nothing was registered.
+    """What is known about the registration of one scan; None if it was not registered.
 
     Args:
         frame: index of the scan.
-        status: "ok"; "recovered": the first attempt was doubtful and the best of several was kept; "coasted": no
-            attempt was acceptable and the pose is predicted; "restarted": likewise, and the map was begun anew.
-        initialization: who made the initial guess: ni, cv, ei, posenet, start (several hypotheses) or recovery.
-        points: points that were registered.
-        iterations: Gauss-Newton steps.
-        converged: whether the steps ended below the tolerances.
+        status: "ok"; "recovered": the first registration was doubtful, and the best of several was kept; "coasted": no
+            registration was acceptable, and the pose is predicted; "restarted": the pose is predicted, and a new map
+            starts with this scan.
+        initialization: source of the guess: the initialization's name for itself, e.g. ni, cv, ei or posenet; "start":
+            the best of many motions, as none is known; "recovery": a motion tried after a doubtful registration.
+        points: number of points to register.
+        iterations: number of Gauss-Newton steps.
+        converged: whether the last step was below the tolerances.
         overlap: share of the points that have a neighbour in the map.
-        inlier_share: share of those that fit it.
+        inlier_share: share of these points that lie on the map's surface.
         rmse_m: weighted root mean square of the residuals [m].
-        skew_m: length of the motion that the compensation of the scan left over, over a scan period [m].
-        skew_deg: angle of the same [deg].
-        min_information: share of the points that notice a move in the weakest direction.
-        degenerate: whether that is too little for the motion in this direction to be relied on. With less than
-            `registration.min_information` it is a prediction.
+        skew_m: translation, over a scan period, that deskewing left over [m], see `RegistrationResult.skew`.
+        skew_deg: rotation, over a scan period, that deskewing left over [deg].
+        min_information: `RegistrationResult.information` along the weakest direction.
+        degenerate: whether that is too little to rely on the motion along this direction. Below
+            `registration.min_information` the motion along it is the guess.
         weakest_direction: that direction, a unit vector in the sensor's frame.
         deviation_m: distance between the registered motion and constant velocity [m].
         deviation_deg: angle between the two [deg].
-        implausible: whether that is more than a vehicle can do in one scan.
+        implausible: whether the deviation is more than a vehicle can do in one scan.
     """
 
     frame: int
@@ -63,7 +65,7 @@ _AXES = ("x", "y", "z")
 
 
 def write_health(path: Path, records: Iterable[Health]) -> None:
-    """Write one row per frame as CSV, cells empty where nothing is known; the weakest direction takes three columns."""
+    """Write one row per frame as CSV, with empty cells for None; the weakest direction takes three columns."""
     names = [f.name for f in fields(Health) if f.name != "weakest_direction"]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

@@ -1,4 +1,4 @@
-"""When a registration is doubted."""
+"""The thresholds by which registrations are accepted, doubted and compared."""
 
 from dataclasses import dataclass
 
@@ -9,27 +9,25 @@ from lidarlearn.registration.result import RegistrationResult
 
 @dataclass(frozen=True)
 class Judgement:
-    """When a registration is doubted.
+    """When a registration is accepted, and when it is doubted.
 
     Args:
-        min_points: fewest points that can be registered.
+        min_points: smallest number of points that is registered.
         min_overlap: smallest acceptable share of points that have a neighbour in the map.
-        min_inlier_share: smallest acceptable share of those that fit it.
-        min_fit_share: smallest expected `RegistrationResult.fit` as a share of the best of the last scans: below it,
-            other motions are tried, as after a turn that is too wide to be pulled in and finds a false fit near by.
-        min_information: the weakest direction counts as degenerate below it, see `RegistrationResult.information`, and
-            below that of the registration, which holds what it knows less of.
-            Normals of noisy points pose as information: up to 0.013 in a corridor, with projective association and
-            3 cm of noise; a street has 0.04 and more, a motorway as little as 0.004.
+        min_inlier_share: smallest acceptable share of these points that lie on the map's surface.
+        min_fit_share: a registration is doubted if its `RegistrationResult.fit` is below this share of the best of the
+            last scans, as after a turn so wide that the registration ends at a false fit.
+        min_information: the weakest direction is degenerate below this `RegistrationResult.information`, or below
+            `GaussNewton.min_information`. Normals of noisy points look like information: up to 0.013 in a corridor,
+            with projective association and 3 cm of noise. A street has 0.04 and more, a motorway as little as 0.004.
         max_deviation_m: largest plausible change of motion from one scan to the next [m]; 0.5 m at 10 Hz is an
             acceleration of 50 m/s^2.
         max_deviation_deg: largest plausible change of rotation from one scan to the next [deg].
-        min_gain: an implausible change of motion is believed only if the scan agrees so much better with it than with
-            no change, see `GaussNewton.agreement`: by 0.2 after a turn of 20 deg; a smaller change with less, in
-            proportion.
-            Registered to the previous scan alone, standing still agrees by up to 0.02 better than driving on a
-            motorway.
-        restart_after: with so many scans in a row without an acceptable registration the map is begun anew.
+        min_gain: an implausible change of motion is accepted only if its `GaussNewton.agreement` exceeds that of the
+            unchanged motion by this much; smaller changes need proportionally less. After a turn by 20 deg it exceeds
+            it by 0.2. On a motorway, registered to the previous scan alone, standing still agrees by up to 0.02 better
+            than driving.
+        restart_after: number of scans in a row without an acceptable registration after which a new map is started.
     """
 
     min_points: int = 100
@@ -50,15 +48,15 @@ class Judgement:
         return result.overlap.item() >= self.min_overlap and result.inlier_share.item() >= self.min_inlier_share
 
     def is_plausible(self, deviation: MotionDifference) -> bool:
-        """Whether a motion that differs so much from the one before it can follow it."""
+        """Whether a vehicle can change its motion by this much in one scan."""
         return self._surprise(deviation) <= 1
 
     def credibility(self, agreement: float, deviation: MotionDifference) -> float:
-        """By what motions are compared: how well the scan agrees with one, less what it takes to believe it.
+        """Score by which candidate motions are ranked: agreement with the map minus a penalty for an abrupt change.
 
         Args:
-            agreement: see `GaussNewton.agreement`, 0..1.
-            deviation: how far it is from the motion before it.
+            agreement: see `GaussNewton.agreement`, 0 to 1.
+            deviation: difference from the last motion.
         """
         return agreement - self.min_gain * min(self._surprise(deviation), 1.0)
 

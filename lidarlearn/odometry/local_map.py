@@ -8,13 +8,14 @@ from lidarlearn.registration.association.base import Association
 
 
 class LocalMap:
-    """A sliding window over the last registered scans; with a size of 1 the previous scan (frame-to-frame).
+    """Chooses the scans of the map: the last key frames, or with a size of 1 the previous one (frame-to-frame).
 
     Args:
-        association: the searchable map that holds the scans.
-        size: number of scans in the window.
-        key_frame_distance_m: a scan is added once the sensor moved this far from the last one added [m]...
-        key_frame_angle_deg: ...or turned by this angle [deg]. 0 switches one of them off, 0 for both adds every scan.
+        association: holds the scans and searches them.
+        size: number of scans in the map.
+        key_frame_distance_m: a scan is added once the sensor has moved this far from the last key frame [m]...
+        key_frame_angle_deg: ...or turned by this angle [deg]. 0 switches one of them off; with both 0 every scan is
+            added.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood": k = 30.
     """
@@ -35,7 +36,7 @@ class LocalMap:
         self._T_world_key: Tensor | None = None
 
     def update(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"]) -> None:
-        """Add a registered scan, unless it is too close to the last one added."""
+        """Add a registered scan, unless it is too close to the last key frame."""
         if self._is_key_frame(T_world_lidar):
             self.association.insert(points, T_world_lidar, self.size)
             self._T_world_key = T_world_lidar

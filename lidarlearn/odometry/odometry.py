@@ -27,12 +27,12 @@ class Odometry(ScanByScan):
 
     Args:
         initialization: guesses the motion.
-        backend: samples, registers and keeps the map; what it holds of another drive is forgotten.
-        judgement: when a registration is doubted.
-        min_range_m: closer returns are dropped: the vehicle itself [m].
-        max_range_m: farther returns are dropped [m].
-        recovery: whether a doubtful registration is tried again from other motions, and the start from several.
-        device: where everything runs.
+        backend: samples, registers and keeps the map; a map of another drive is cleared.
+        judgement: when a registration is accepted, and when it is doubted.
+        min_range_m: closer points are dropped, as they lie on the vehicle [m].
+        max_range_m: farther points are dropped [m].
+        recovery: whether other motions are tried for a map's second scan, and after a doubtful registration.
+        device: where points are processed.
 
     Source: Dellenbach et al. 2021, III-A.
     """
@@ -62,7 +62,7 @@ class Odometry(ScanByScan):
         self._guess_errors_m: deque[float] = deque(maxlen=5)
         self._fits: deque[float] = deque(maxlen=5)
         self._frames = 0
-        self._coasted = 0  # scans in a row
+        self._coasted = 0  # scans since the last one in the map
 
     @torch.no_grad()
     def register_scan(self, points: Points, times: Times | None = None) -> Frame:
@@ -123,7 +123,7 @@ class Odometry(ScanByScan):
             self._backend.local_map.update(points, first.T_world_lidar)
 
     def _register_and_update(self, scan: SampledScan, guess: Guess) -> Health:
-        """Register a scan, again from other motions if in doubt, and add it to the map; or else coast."""
+        """Register a scan, again from other motions if in doubt, and add it to the map; coast if none is acceptable."""
         status: Status = "ok"
         attempt = self._register(scan, guess)
         if self._recovery and not self._is_starting and self._is_doubtful(attempt):
@@ -218,7 +218,7 @@ class Odometry(ScanByScan):
         return se3.exp(se3.log(T_first_new) / (1 + self._coasted))
 
     def _coast(self) -> None:
-        """Move as before; after too many scans without a registration, begin a new map."""
+        """Move as before; after too many scans in a row, clear the map, so that the next scan starts a new one."""
         self._move(self._last_motion)
         self._coasted += 1
         if self._coasted >= self._judgement.restart_after:
@@ -243,6 +243,6 @@ class _FirstScan:
 
 
 def _guess_error_m(scan: SampledScan, T_guess: Tensor, T_previous_new: Tensor) -> float:
-    """How far a point at the mean range was from where the guess had it."""
+    """How far a guess put a point at the mean range from where it is registered [m]."""
     error = se3.motion_difference(T_guess, T_previous_new)
     return error.distance_m + math.radians(error.angle_deg) * scan.mean_range_m

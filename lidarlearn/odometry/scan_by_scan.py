@@ -1,4 +1,4 @@
-"""What every odometry is: scans in, one by one, poses out."""
+"""The interface of odometries: scans in, one by one, poses out."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from lidarlearn.odometry.initialization.base import Initialization
 
 @dataclass(frozen=True)
 class Frame:
-    """A scan's place in the trajectory.
+    """The pose of a scan, and whether to trust it.
 
     Args:
-        T_world_lidar: its pose, float64, on the CPU; the first one is the identity.
-        health: whether to trust it.
+        T_world_lidar: the pose, float64, on the CPU; the first one is the identity.
+        health: the health record.
     """
 
     T_world_lidar: Float[Tensor, "4 4"]
@@ -28,13 +28,13 @@ class Frame:
 
 _MAX_TIME = 1.5  # of a point, in scan periods before or after the instant of the pose
 
-# Of any number type, on any device, arrays in any order of memory; `as_scan` checks them, for they come from users.
+# Of any number type, on any device, arrays in any memory order. They come from users, so `as_scan` checks them.
 Points = Tensor | np.ndarray
 Times = Tensor | np.ndarray
 
 
 class ScanByScan(ABC):
-    """Anything that takes scans in order and says where they were taken."""
+    """Takes scans in order and estimates where they were taken."""
 
     @abstractmethod
     def register_scan(self, points: Points, times: Times | None = None) -> Frame:
@@ -42,20 +42,20 @@ class ScanByScan(ABC):
 
         Args:
             points: the scan (n, 3) [m], in the sensor's frame; may be empty or hold values that are not finite.
-            times: when each point was measured (n,), to compensate the motion within the scan: as a share of the scan
-                period, from the instant of the pose, e.g. -0.5 to 0.5; see `lidarlearn.data.sequence.Scan`. Points
-                with other times are left out. None where there is nothing to compensate.
+            times: time of each point (n,), to compensate the motion within the scan: from the instant of the pose, as a
+                share of the scan period, e.g. -0.5 to 0.5; see `lidarlearn.data.sequence.Scan`. Points with other times
+                are left out. None: there is nothing to compensate.
 
         Raises:
             ValueError: the points are not (n, 3), there are more or fewer times than points, or most of the times are
-                no shares of a scan period.
+                not shares of a scan period.
         """
 
 
 def as_scan(
     points: Points, times: Times | None, device: torch.device | None = None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"] | None]:
-    """Points and times as float32 tensors on one device, the points' if none is given; see `register_scan`."""
+    """Check points and times; both as float32 tensors on one device, by default that of the points."""
     points = _as_tensor(points, device)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"register_scan: points must be (n, 3), x y z [m], but are {tuple(points.shape)}")
@@ -75,12 +75,12 @@ def as_scan(
 
 
 def are_shares_of_a_period(times: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
-    """Which times can be those of points of one scan, whatever instant of it the pose is that of."""
+    """Which times are possible for points of one scan, at whatever instant of it the pose is."""
     return times.abs() <= _MAX_TIME
 
 
 def _as_tensor(values: Tensor | np.ndarray, device: torch.device | None) -> Tensor:
-    if isinstance(values, np.ndarray):  # views that torch refuses: reversed, of another byte order, read-only
+    if isinstance(values, np.ndarray):  # torch refuses views that are reversed, in another byte order, or read-only
         values = np.require(values, np.float32, ["C", "W"])
     return torch.as_tensor(values, dtype=torch.float32, device=device)
 
@@ -89,7 +89,7 @@ class InitializationAlone(ScanByScan):
     """Accumulates the guesses of an initialization, without any registration.
 
     Args:
-        initialization: what guesses.
+        initialization: guesses the motion.
         device: where it runs.
     """
 

@@ -1,4 +1,4 @@
-"""Scans that give way: the motion during a scan that its compensation left over."""
+"""Residual motion distortion: motion within a scan that deskewing left over."""
 
 import math
 from dataclasses import dataclass, replace
@@ -14,17 +14,17 @@ _MIN_VARIANCE_M2 = 1e-6  # of the residuals
 
 @dataclass(frozen=True)
 class Elasticity:
-    """How much motion is left over in a scan, once it is compensated.
+    """Prior on the residual motion of a scan, its skew.
 
-    Scans are compensated as if they moved evenly, or by whoever published them: in KITTI 04 two of five are skewed by
-    9 cm from their beginning to their end. What is left is taken for a twist in proportion to time. It is estimated
-    together with the last step of a registration, and expected to be small: of a skew that all scans share, a map of
-    the same scans says little.
+    Deskewing assumes constant velocity; as published, two scans of five in KITTI 04 stay distorted by 9 cm from
+    beginning to end. The rest is modelled as a twist proportional to time and estimated with the last Gauss-Newton
+    step. The prior keeps it small: a skew that all scans share hardly shows against a map of these scans.
 
     Args:
-        translation_m: how much of it is expected over a scan period, along each axis, as a standard deviation [m].
-        rotation_deg: likewise, about each axis [deg].
-        points_per_measurement: neighbouring points err alike: so many say as much as one by itself would.
+        translation_m: standard deviation of the skew over a scan period along each axis [m].
+        rotation_deg: standard deviation of the skew over a scan period about each axis [deg].
+        points_per_measurement: errors of neighbouring points are correlated; this many count as one independent
+            measurement.
 
     Source: the idea of two poses a scan, Dellenbach et al., "CT-ICP", ICRA 2022.
     """
@@ -38,18 +38,18 @@ class Elasticity:
             raise ValueError(f"registration: elasticity must be above 0, got {self}; none at all is elasticity=null")
 
     def equations(self, rigid: NormalEquations, phases: Float[Tensor, "n"]) -> "ElasticEquations":
-        """Those of pose and skew together.
+        """Extend the normal equations of a pose by the skew.
 
         Args:
-            rigid: those of the pose alone.
+            rigid: equations of the pose of a rigid scan.
             phases: when each point was measured, as a share of the scan period.
         """
         across, within = rigid.terms.phase_moments(phases)
         variance = rigid.squares / np.maximum(np.trace(rigid.H[..., :3, :3], axis1=-2, axis2=-1), 1e-12)
-        expected = np.repeat([self.translation_m, math.radians(self.rotation_deg)], 3) ** 2
-        held = self.points_per_measurement * (variance + _MIN_VARIANCE_M2)[..., None] / expected
-        H_skew = within[..., :6, :6] + held[..., None] * np.eye(6)
-        gain = np.linalg.solve(H_skew, across[..., :6, :])  # of the skew by the pose's six unknowns, and by itself
+        prior_variance = np.repeat([self.translation_m, math.radians(self.rotation_deg)], 3) ** 2
+        prior_information = self.points_per_measurement * (variance + _MIN_VARIANCE_M2)[..., None] / prior_variance
+        H_skew = within[..., :6, :6] + prior_information[..., None] * np.eye(6)
+        gain = np.linalg.solve(H_skew, across[..., :6, :])  # by the step of the pose, and without a step
         return ElasticEquations(
             pose=replace(
                 rigid,
@@ -62,16 +62,16 @@ class Elasticity:
 
 @dataclass(frozen=True)
 class ElasticEquations:
-    """Normal equations of a scan that gives way.
+    """Normal equations of pose and skew, reduced to the pose by the Schur complement.
 
     Args:
-        pose: of the pose, with the skew eliminated.
-        gain: how the skew follows the pose: by -gain times (step, 1).
+        pose: the equations of the pose.
+        gain: the skew is -gain times (step of the pose, 1).
     """
 
     pose: NormalEquations
     gain: Float64[np.ndarray, "*batch 6 7"]
 
     def skew(self, step: Float64[np.ndarray, "*batch 6"]) -> Float64[np.ndarray, "*batch 6"]:
-        """The twist over a scan period, as (translation [m], rotation [rad]), that goes with a step of the pose."""
+        """The skew that goes with a step of the pose: a twist over a scan period, (translation [m], rotation [rad])."""
         return -(self.gain[..., :6] @ step[..., None])[..., 0] - self.gain[..., 6]

@@ -26,26 +26,26 @@ _MIN_MATCHED_SHARE = 0.1  # of the points, below which a good fit is likely to b
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Iteratively reweighted Gauss-Newton with a search distance that narrows.
+    """Iteratively reweighted Gauss-Newton with a narrowing search distance.
 
     Args:
         residual: what is minimized.
         weight: the robust weight.
-        max_iterations: steps at most.
-        search_distance_m: correspondences are searched within this distance at the end [m].
+        max_iterations: largest number of steps.
+        search_distance_m: final search distance for correspondences [m].
         narrowing: factor of the search distance from one iteration to the next, until it is `search_distance_m`; the
             scale of the robust weight narrows with it (graduated non-convexity, Blake & Zisserman 1987).
-        coarse_stride: while the search distance is wider, only every so manieth point is used.
-        min_information: the position is left as initialized in directions of which the map says less than this, see
-            `RegistrationResult.information`. Source: after Zhang, Kaess & Singh, "On degeneracy of optimization-based
+        coarse_stride: every n-th point is used while the search distance is wider than `search_distance_m`.
+        min_information: along directions with less `RegistrationResult.information` than this, the position keeps its
+            initial value. Source: after Zhang, Kaess & Singh, "On degeneracy of optimization-based
             state estimation problems", ICRA 2016.
-        inlier_residual_m: a correspondence counts as an inlier below this distance from the map's surface [m].
+        inlier_residual_m: points closer to the map's surface are inliers [m].
         fit_residual_m: scale of `RegistrationResult.fit` [m].
-        translation_tolerance_m: converged when a step is shorter [m]...
-        rotation_tolerance_deg: ...and turns by less [deg].
+        translation_tolerance_m: converged if a step is shorter [m]...
+        rotation_tolerance_deg: ...and its rotation smaller [deg].
         max_step_m: longest translation of one step [m].
         max_step_deg: largest rotation of one step [deg].
-        elasticity: how far scans give way whose points say when they were measured; None: not at all.
+        elasticity: prior on the residual motion of scans with phases; None: every scan is rigid.
     """
 
     residual: Residual = field(default_factory=PointToPlane)
@@ -91,7 +91,7 @@ class GaussNewton:
         normals: Float[Tensor, "n 3"] | None = None,
         phases: Float[Tensor, "n"] | None = None,
     ) -> RegistrationResult:
-        """Move the scan to where it fits the map, from one or several initial poses at once.
+        """Find the poses at which the scan fits the map, from one or several initial poses at once.
 
         Args:
             points: the new scan [m], in its own frame.
@@ -99,15 +99,15 @@ class GaussNewton:
             T_world_lidar: initial poses, float64, on any device.
             search_distance_m: search distance of the first iteration [m].
             normals: unit normals of the new scan; only generalized ICP needs them.
-            phases: when each point was measured, as a share of the scan period; without, the scan is rigid.
+            phases: when each point was measured, as a share of the scan period; None: the scan is rigid.
 
         Returns:
-            The result; with nothing to hold on to, the initial pose, not converged, with an overlap of 0.
+            The result; without any correspondence the initial pose, not converged, with an overlap of 0.
         """
         T = T_world_lidar.cpu().numpy()
         converged = np.zeros(T.shape[:-2], dtype=bool)
         matching, queries = self._matching(association), Queries(points, normals)
-        # Where functions are recorded, another number of points would take another recording, and no less time.
+        # A recorded function with fewer points would be another recording, and no faster.
         is_recorded = matching.recordings(queries) is not None
         coarse = queries if is_recorded else queries.every(self.coarse_stride)
         iterations, neighbours = 0, None
@@ -140,16 +140,16 @@ class GaussNewton:
         search_distance_m: float,
         normals: Float[Tensor, "n 3"] | None = None,
     ) -> Float[Tensor, "*batch"]:
-        """How well poses far from each other agree with the map: the share of points that fit, of all with a neighbour.
+        """Share of the points with a neighbour that lie on the map's surface; comparable between distant poses.
 
-        Unlike `RegistrationResult.fit` it is not drawn to where most points have a neighbour. The rings of a scan on
-        the ground lie on those of the scan before when the sensor is taken to stand still, however fast it drives.
+        Unlike `RegistrationResult.fit` it does not favour poses where more points have a neighbour, such as standing
+        still, where the ground rings of two scans coincide.
 
         Args:
             points: the new scan [m], in its own frame.
             association: the map.
             T_world_lidar: poses, float64.
-            search_distance_m: what is farther from the map says nothing [m]: wide enough to see what does not fit.
+            search_distance_m: search distance [m], wide enough to include points that do not fit.
             normals: as in `register`.
         """
         matching, T = self._matching(association), T_world_lidar.cpu().numpy()
@@ -167,12 +167,12 @@ class GaussNewton:
         return Matching(self.residual, self.weight, self.search_distance_m, association)
 
     def _step(self, equations: NormalEquations) -> Float64[np.ndarray, "*batch 6"]:
-        """The minimum of the linearized energy, on condition that the position stays where nothing is known of it."""
+        """The minimum of the linearized energy, but without a move along degenerate directions of the position."""
         known = equations.localizability
         step = -(known.covariance @ equations.g[..., None])
-        unknown = (known.information < self.min_information)[..., None]
+        is_degenerate = (known.information < self.min_information)[..., None]
         along = known.directions.swapaxes(-1, -2) @ step[..., :3, :]
-        step = (step - known.pose_directions @ (unknown * along))[..., 0]
+        step = (step - known.pose_directions @ (is_degenerate * along))[..., 0]
         excess = step_sizes(step) / self._max_step
         return step / np.maximum(excess.max(-1, keepdims=True), 1.0)
 
@@ -184,14 +184,14 @@ class GaussNewton:
         converged: Bool[np.ndarray, "*batch"],
         equations: NormalEquations,
     ) -> RegistrationResult:
+        directions, information = equations.localizability.directions, equations.localizability.information
+        order = information.argsort(axis=-1)
+        weakest = np.take_along_axis(directions, order[..., None, :], axis=-1)[..., 0]
         terms = equations.terms
         count = functools.partial(self._counts, terms)
         counts = terms.recordings(count, device=terms.mask.device, settings=self, reads_first=True)
         neighbours, inliers, fit, weight = counts.numpy()
         points = max(equations.points, 1)
-        directions, information = equations.localizability.directions, equations.localizability.information
-        order = information.argsort(axis=-1)
-        weakest = np.take_along_axis(directions, order[..., None, :], axis=-1)[..., 0]
         return RegistrationResult(
             T_world_lidar=se3.orthonormalize(torch.from_numpy(T)),
             skew=torch.from_numpy(skew),
@@ -207,11 +207,11 @@ class GaussNewton:
         )
 
     def _counts(self, terms: Terms) -> Float[Tensor, "4 *batch"]:
-        """Number of points with a neighbour, of those that fit, how well all fit, and the weights; summed up."""
+        """Sums over all points: those with a neighbour, the inliers, the fits and the weights."""
         neighbour = terms.mask.double()
         inlier = neighbour * (terms.surface_distances_m < self.inlier_residual_m)
         return torch.stack([neighbour, inlier, self._fits(terms), terms.weights]).sum(-1)
 
     def _fits(self, terms: Terms) -> Float[Tensor, "*batch m"]:
-        """How well each point fits the map's surface, 0..1, 0 without a neighbour."""
+        """How well each point fits the map's surface, 0 to 1; 0 without a neighbour."""
         return terms.mask * torch.exp(-((terms.surface_distances_m / self.fit_residual_m) ** 2))

@@ -1,4 +1,4 @@
-"""What a scan's points say about its pose: matched with a map, weighted and linearized."""
+"""Correspondences of a scan with a map, weighted and linearized into normal equations."""
 
 import functools
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from lidarlearn.registration.normal_equations import NormalEquations, Terms, aug
 from lidarlearn.registration.residuals import Residual
 from lidarlearn.registration.weights import RobustWeight
 
-_PADDING = cuda_graphs.Padding(value=1e6)  # with points [m] that are near to nothing
+_PADDING = cuda_graphs.Padding(value=1e6)  # coordinates [m] far from any map point
 
 _HessianAndTerms = tuple[Float64[Tensor, "*batch 7 7"], Terms]
 
@@ -25,26 +25,26 @@ class Queries:
     """Points to register.
 
     Args:
-        points: in the new scan's frame [m].
-        normals: theirs, where the residual needs them.
+        points: the points [m], in the new scan's frame.
+        normals: their unit normals, if the residual needs them.
     """
 
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"] | None
 
     def every(self, stride: int) -> "Queries":
-        """Every so manieth of them."""
+        """Every n-th of them."""
         return Queries(self.points[::stride], None if self.normals is None else self.normals[::stride])
 
 
 @dataclass(frozen=True)
 class Matching:
-    """Makes the normal equations of a scan at a pose.
+    """Matches a scan with a map, and linearizes the result.
 
     Args:
         residual: what is minimized.
         weight: the robust weight.
-        search_distance_m: the final one, at which the weight has its own scale [m].
+        search_distance_m: the final search distance [m]. While the search is wider, the weight's scale is, too.
         association: the map.
     """
 
@@ -60,13 +60,13 @@ class Matching:
         distance_m: float,
         last: Neighbours | None = None,
     ) -> NormalEquations:
-        """The equations at one or several poses.
+        """The normal equations at one or several poses.
 
         Args:
             queries: the scan.
             T_world_lidar: the poses.
-            distance_m: how far neighbours are searched [m].
-            last: what was found before, see `Association.search`.
+            distance_m: search distance [m].
+            last: neighbours of the last call with the same queries, see `Association.search`.
         """
         points, recordings = queries.points, self.recordings(queries)
         if recordings is None:
@@ -77,7 +77,7 @@ class Matching:
         hessian, terms = recordings(
             functools.partial(self._recorded_terms, shape=T_world_lidar.shape, reach_m=reach_m),
             points,
-            torch.from_numpy(np.append(T_world_lidar, distance_m)),  # sent at once
+            torch.from_numpy(np.append(T_world_lidar, distance_m)),  # one transfer
             device=points.device,
             settings=(self.residual, self.weight, self.search_distance_m, reach_m, T_world_lidar.shape),
             padding=_PADDING,
@@ -87,7 +87,7 @@ class Matching:
         return NormalEquations.of(hessian, terms, len(points))
 
     def recordings(self, queries: Queries) -> cuda_graphs.Recordings | None:
-        """Where this is recorded, if it is: not for generalized ICP, which inverts matrices."""
+        """Where the computation is recorded; None if it is not, as for generalized ICP, which inverts matrices."""
         is_recorded = cuda_graphs.are_used_on(queries.points.device) and queries.normals is None
         return self.association.recordings if is_recorded else None
 
@@ -106,7 +106,7 @@ class Matching:
         normals: Float[Tensor, "n 3"] | None = None,
         last: Neighbours | None = None,
     ) -> _HessianAndTerms:
-        """Neighbours are searched within `reach_m` and count within `distance_m`."""
+        """Search neighbours within `reach_m`, and use those within `distance_m`."""
         points_world = se3.transform(T, points)
         found = self.association.search(points_world.reshape(-1, 3), reach_m, last)
         map_points = found.points.view_as(points_world)
@@ -116,7 +116,7 @@ class Matching:
         residuals, offsets = augmented_jacobians[..., 6], points_world - map_points
         is_distance = residuals.shape[-1] == 1
         size = residuals[..., 0].abs() if is_distance else residuals.norm(dim=-1)
-        widening = distance_m / self.search_distance_m  # a narrow kernel would hold on to whatever is near by chance
+        widening = distance_m / self.search_distance_m  # a narrow kernel would keep what is near by chance
         squared_distances = offsets.square().sum(-1)
         if isinstance(distance_m, Tensor):
             mask = mask & (squared_distances <= distance_m**2)
@@ -124,7 +124,7 @@ class Matching:
         return augmented_hessian(augmented_jacobians.double(), weights), Terms(
             neighbours=found.neighbours,
             mask=mask,
-            # Whatever is minimized, a pose is judged by how far points are off the map's surface, not along it.
+            # A pose is judged by the distance across the map's surface, not along it, whatever is minimized.
             surface_distances_m=size if is_distance else (offsets * map_normals).sum(-1).abs(),
             weights=weights,
             augmented_jacobians=augmented_jacobians,

@@ -1,7 +1,7 @@
 """Residuals of correspondences and their derivatives by a small motion of the new scan.
 
-The motion is applied in the new scan's own frame, T <- T exp(xi) with xi = (translation, rotation): the derivatives
-are then well conditioned however far the sensor is from the map's origin.
+The motion is applied in the new scan's own frame, T <- T exp(xi) with xi = (translation, rotation), so that the
+derivatives are well conditioned at any distance from the map's origin.
 """
 
 from abc import ABC, abstractmethod
@@ -16,7 +16,7 @@ from lidarlearn.geometry import se3
 
 
 class Residual(ABC):
-    """What a registration minimizes the weighted squares of."""
+    """A registration minimizes the weighted sum of its squares."""
 
     needs_normals = False  # of the new scan's points
 
@@ -34,10 +34,10 @@ class Residual(ABC):
 
         Args:
             T_world_lidar: pose of the new scan.
-            points: its points, in its own frame.
+            points: points of the new scan, in its own frame.
             points_world: the same points, in the map's frame.
-            map_points: the points they are associated with.
-            map_normals: unit normals there, zero where undefined.
+            map_points: the map point associated with each.
+            map_normals: unit normals of the map points, zero where undefined.
             normals: unit normals of the new scan, in its own frame; used by generalized ICP.
 
         Returns:
@@ -61,7 +61,7 @@ class PointToPlane(Residual):
         normals: Tensor | None = None,
     ) -> Tensor:
         """One residual per correspondence; zero where the map has no normal."""
-        normals_lidar = map_normals @ T_world_lidar[..., :3, :3].to(points)  # R^T n, row by row
+        normals_lidar = map_normals @ T_world_lidar[..., :3, :3].to(points)  # R^T n
         r = ((points_world - map_points) * map_normals).sum(-1, keepdim=True)
         lever = torch.linalg.cross(points.expand_as(normals_lidar), normals_lidar)
         return torch.cat([normals_lidar, lever, r], dim=-1)[..., None, :]
@@ -85,15 +85,15 @@ class PointToPoint(Residual):
 
 @dataclass(frozen=True)
 class GeneralizedIcp(Residual):
-    """T p - q, whitened by the covariances of the two surfaces it lies between.
+    """T p - q, whitened by the covariances of both surfaces.
 
-    Each point stands for a disc of unit variance along its surface and `epsilon` across it. With the whitening
-    L of (C_q + R C_p R^T)^-1 = L L^T, scaled so that a plane met face to face gives the point-to-plane distance, the
-    squared residual is the Mahalanobis distance of Segal et al., "Generalized-ICP", RSS 2009. A new point without a
-    normal is taken to lie on the surface that it is matched with.
+    Each point stands for a disc of unit variance along its surface and `epsilon` across it. The residual is
+    L^T (T p - q) with (C_q + R C_p R^T)^-1 = L L^T, so its square is the Mahalanobis distance of Segal et al.,
+    "Generalized-ICP", RSS 2009. It is scaled to be the point-to-plane distance where the two surfaces are parallel. A
+    new point without a normal takes that of the map point.
 
     Args:
-        epsilon: variance across the surface over the variance along it.
+        epsilon: variance across the surface, relative to the variance along it.
     """
 
     epsilon: float = 1e-2
@@ -116,7 +116,7 @@ class GeneralizedIcp(Residual):
             raise ValueError("generalized ICP needs the normals of the new scan")
         R = T_world_lidar[..., :3, :3].to(points)
         own = normals @ R.mT
-        own = torch.where((own != 0).any(-1, keepdim=True), own, map_normals)  # unknown: the surface it is matched with
+        own = torch.where((own != 0).any(-1, keepdim=True), own, map_normals)
         covariance = self._disc(map_normals) + self._disc(own)
         whitening = torch.linalg.cholesky(torch.linalg.inv(covariance)).mT * (2 * self.epsilon) ** 0.5
         return whitening @ _point_jacobians(T_world_lidar, points, points_world - map_points)
@@ -129,7 +129,7 @@ class GeneralizedIcp(Residual):
 def _point_jacobians(
     T_world_lidar: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "n 3"], offsets: Float[Tensor, "*batch n 3"]
 ) -> Float[Tensor, "*batch n 3 7"]:
-    """d(T exp(xi) p)/dxi = [R, -R hat(p)], and the offsets beside it."""
+    """[J r] with J = d(T exp(xi) p)/dxi = [R, -R hat(p)] and the offsets as residuals."""
     R = T_world_lidar[..., None, :3, :3].to(points)
     R = R.expand(*R.shape[:-3], len(points), 3, 3)
     return torch.cat([R, -R @ se3.hat(points), offsets[..., None]], dim=-1)

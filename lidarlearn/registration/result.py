@@ -1,4 +1,4 @@
-"""What a registration says."""
+"""The result of a registration."""
 
 from dataclasses import dataclass
 
@@ -8,25 +8,26 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RegistrationResult:
-    """Where a scan fits, and how well: enough to judge an alignment instead of trusting it.
+    """The pose at which a scan fits, and the figures by which to judge whether it does.
 
-    Tensors share the batch shape of the initial poses, and are on the CPU as poses are.
+    Tensors have the batch shape of the initial poses and are on the CPU.
 
     Args:
         T_world_lidar: the registered poses, float64.
-        skew: motion over the scan period that the compensation of the points left over, as a twist of (translation
-            [m], rotation [rad]) in the sensor's frame, see `Elasticity`; zero where none was looked for.
-        iterations: Gauss-Newton steps taken, those of the slowest of a batch.
+        skew: motion over a scan period that deskewing left over, as a twist (translation [m], rotation [rad]) in the
+            sensor's frame, see `Elasticity`; zero if it was not estimated.
+        iterations: number of Gauss-Newton steps; of a batch, those of the slowest.
         converged: whether the last step was below the tolerances, at the final search distance.
         overlap: share of the points that have a map neighbour with a normal within the search distance.
-        inlier_share: share of those whose distance d from the map's surface is below `inlier_residual_m`.
-        fit: mean over all points of exp(-(d / fit_residual_m)^2), 0 for those without a neighbour: sharper than the
-            inlier share, it tells the right pose from its neighbours.
+        inlier_share: share of these points whose distance d from the map's surface is below `inlier_residual_m`.
+        fit: mean over all points of exp(-(d / fit_residual_m)^2), 0 for points without a neighbour. Sharper than the
+            inlier share: it distinguishes the right pose from one close by.
         rmse_m: weighted root mean square of the residuals [m].
-        hessian: of the weighted half squares by (translation [m], rotation [rad]) in the sensor's frame.
-        information: weighted share of all points that notice a move along each of the three axes of the position's
-            covariance, ascending: 0 along a corridor, where no residual changes however the pose follows.
-        weakest_direction: unit vector, in the sensor's frame, of the smallest of them.
+        hessian: of half the weighted sum of squared residuals, by (translation [m], rotation [rad]) in the sensor's
+            frame.
+        information: weighted share of all points whose residual changes noticeably when the position moves along each
+            principal axis of its covariance, ascending. 0 along a corridor: nothing shows such a move.
+        weakest_direction: the axis with the least information, a unit vector in the sensor's frame.
     """
 
     T_world_lidar: Float[Tensor, "*batch 4 4"]

@@ -1,7 +1,7 @@
 """Robust weights of iteratively reweighted least squares.
 
-Each is a small frozen class with one method, `weight`, of the sizes of the residuals and of the squared distances
-between the associated points. Weights are in [0, 1]; the scale parameters are in metres.
+Each is a small frozen class with one method, `weight`: from residuals and squared distances between the associated
+points to weights in [0, 1]. The scale parameters are in metres.
 """
 
 from abc import ABC, abstractmethod
@@ -15,7 +15,7 @@ from lidarlearn.errors import require_positive
 
 
 class RobustWeight(ABC):
-    """How much a correspondence counts; scales in metres, whose names end in `_m`, must be above 0."""
+    """How much a correspondence counts. Scales are in metres, have names that end in `_m`, and must be above 0."""
 
     def __post_init__(self) -> None:
         scales = {name: value for name, value in vars(self).items() if name.endswith("_m")}

@@ -1,4 +1,4 @@
-"""What an initialization is."""
+"""The interface of initializations."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -13,8 +13,9 @@ class InitialMotion:
     """A guess of the motion since the previous scan.
 
     Args:
-        T_previous_new: the motion, float64, on the CPU as all poses of an odometry: only points are on its device.
-        source: who made the guess: an initialization may fall back to another.
+        T_previous_new: the motion, float64, on the CPU like all poses of an odometry.
+        source: name of the initialization that made the guess, perhaps a fallback of another; only shown in the health
+            record.
     """
 
     T_previous_new: Float[Tensor, "4 4"]
@@ -31,7 +32,7 @@ class InitialMotion:
 
 
 class Initialization(ABC):
-    """Guesses the motion of each new scan before it is registered; sees every scan once, in order."""
+    """Guesses the motion of each new scan before it is registered; gets every scan once, in order."""
 
     @abstractmethod
     def predict(self, points: Float[Tensor, "n 3"], last_motion: Float[Tensor, "4 4"]) -> InitialMotion:
@@ -39,5 +40,5 @@ class Initialization(ABC):
 
         Args:
             points: the new scan [m], in the sensor's frame.
-            last_motion: motion between the two previous scans as registered; the identity before there is one.
+            last_motion: registered motion between the two previous scans; the identity if there is none yet.
         """

@@ -23,7 +23,7 @@ class ElevationImage(Initialization):
     """Registers bird's-eye images of the heights above the sensor by ORB features and a robust homography.
 
     Binary descriptors are matched by Hamming distance with a cross check. The homography only decides which matches
-    are inliers; the motion is the rigid one, in the plane, that fits them best.
+    are inliers; the motion is the planar rigid motion that fits them best.
 
     Args:
         size_px: edge of the square image [px].
@@ -31,7 +31,7 @@ class ElevationImage(Initialization):
         max_height_m: heights above the sensor are mapped from 0..max_height_m to 1..255 grey values [m].
         features: ORB features per image.
         inlier_threshold_m: distance up to which a match agrees with the homography [m].
-        min_inliers: with fewer, constant velocity is used instead.
+        min_inliers: with fewer inliers, constant velocity is used instead.
 
     Source: Dellenbach et al. 2021, III-A "Initialization": 800x800 px of 0.30 m, N_I = 100 inliers.
     """

@@ -17,22 +17,22 @@ _PADDING = Padding()
 
 @runtime_checkable
 class TrainedNetwork(Protocol):
-    """What is needed of a network: its image, and the relative pose it sees in two of them."""
+    """The interface that a network needs: relative poses from pairs of vertex maps."""
 
     @property
     def projection(self) -> SphericalProjection:
-        """The image."""
+        """The projection of its vertex maps."""
 
     @property
     def device(self) -> torch.device:
-        """Where the network is."""
+        """The device of its parameters."""
 
     def relative_pose(self, reference: Float[Tensor, "b 3 h w"], target: Float[Tensor, "b 3 h w"]) -> Tensor:
         """`T_ref_new` (b, 4, 4), float64."""
 
 
 class PoseNetInitialization(Initialization):
-    """The motion that a trained network sees between the last two scans.
+    """The motion between the last two scans as estimated by a trained network.
 
     Args:
         network: a trained network, e.g. `lidarlearn.training.trained_network.load_trained_network(ckpt)`.

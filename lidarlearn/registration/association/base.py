@@ -1,4 +1,4 @@
-"""What an association is: a map that grows by scans, forgets the oldest, and finds the neighbours of points."""
+"""The interface of associations: maps of the last scans that find the nearest map point of each query."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from lidarlearn.cuda_graphs import Recordings
 
 @dataclass(frozen=True)
 class Neighbours:
-    """The nearest map point of each query, and what must have happened before it can be another.
+    """The nearest map point of each query, and how close any other candidate can be.
 
     Args:
-        queries: where each query was when its neighbour was looked up [m].
-        bins: which part of the map was looked at, see `Association.bins`.
+        queries: position of each query when its neighbour was searched [m].
+        bins: part of the map that was searched, see `Association.bins`.
         index: the nearest point of that part, -1 where there is none.
-        others_m: all its other points were at least this far from the query [m].
+        others_m: lower bound on the distance of all other candidates [m].
     """
 
     queries: Float[Tensor, "n 3"]
@@ -28,7 +28,7 @@ class Neighbours:
     others_m: Float[Tensor, "n"]
 
     def replaced(self, which: Int[Tensor, "m"], by: "Neighbours") -> "Neighbours":
-        """A copy with some of them exchanged."""
+        """A copy in which some are replaced."""
         return Neighbours(
             self.queries.index_copy(0, which, by.queries),
             self.bins.index_copy(0, which, by.bins),
@@ -39,13 +39,13 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class Correspondences:
-    """The map point that each query point is associated with.
+    """The map point that each query is associated with.
 
     Args:
-        points: map points [m] in the map's frame; meaningless where `mask` is false.
-        normals: unit normals of the map there; zero where undefined.
+        points: map points [m], in the map's frame; meaningless where `mask` is false.
+        normals: unit normals of the map points, zero where undefined.
         mask: whether there is a neighbour within the search distance.
-        neighbours: what a search of the same points, moved a little, may start from.
+        neighbours: the result to pass to the next search for the same points.
     """
 
     points: Float[Tensor, "n 3"]
@@ -55,9 +55,9 @@ class Correspondences:
 
 
 class Association(ABC):
-    """A map of the last `frames` inserted scans, searchable for the neighbours of points.
+    """A searchable map of the last inserted scans.
 
-    The map's frame is fixed ("world"). Points are float32: they resolve 1 mm at 10 km from the origin.
+    The map's frame is fixed ("world"). Points are float32, which resolves 1 mm at 10 km from the origin.
     """
 
     @abstractmethod
@@ -66,8 +66,8 @@ class Association(ABC):
 
         Args:
             points: the scan [m], in the sensor's frame.
-            T_world_lidar: where it was registered.
-            frames: how many scans the map holds, this one included.
+            T_world_lidar: its registered pose.
+            frames: number of scans that the map keeps, this one included.
         """
 
     @abstractmethod
@@ -85,41 +85,41 @@ class Association(ABC):
         """Their unit normals, zero where undefined."""
 
     def points_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Some of `points`, by their index."""
+        """`points[index]`."""
         return self.points[index]
 
     def normals_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Some of `normals`, by their index."""
+        """`normals[index]`."""
         return self.normals[index]
 
     @property
     def recordings(self) -> Recordings | None:
-        """Of functions that search in this map, where all of that is done on its device; else None."""
+        """Recordings of functions that search this map; None if a search leaves the map's device."""
         return None
 
     def reach_m(self, max_distance_m: float) -> float:
-        """A distance of a few, at least as long [m], in which as good as no more has to be looked at.
+        """The search distance rounded up to one of a few values, at little extra work [m].
 
-        Recordings are of one search distance: fewer of them are needed.
+        A recording has a fixed search distance: this bounds their number.
         """
         return max_distance_m
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to search in."""
+        """Whether the map has no points."""
         return len(self.points) == 0
 
     def search(
         self, points_world: Float[Tensor, "n 3"], max_distance_m: float, last: Neighbours | None = None
     ) -> Correspondences:
-        """The neighbour of each point among the map's points, no farther than `max_distance_m`.
+        """The nearest map point of each point, within `max_distance_m`.
 
         Args:
             points_world: points [m], in the map's frame.
-            max_distance_m: farther points of the map are no neighbours [m].
-            last: what was found for the same points where they stood before, in the same map. It changes nothing but
-                the work: a point that moved by less than half the lead of its neighbour over all others keeps it.
-                Left aside if it is of another number of points, and where looking up all is faster than asking which.
+            max_distance_m: search distance [m].
+            last: the previous result for the same points in the same map. A point that moved less than half the gap to
+                its second-nearest candidate keeps its neighbour; results do not change, only the work. Ignored if it
+                has another number of points, or where a new search of all is faster.
         """
         if self.is_empty:
             nothing = torch.zeros_like(points_world)
@@ -136,15 +136,15 @@ class Association(ABC):
         return Correspondences(points, self.normals_at(index), within & (neighbours.index >= 0), neighbours)
 
     def bins(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-        """In which part of the map each point looks for its neighbour: everywhere, if not defined otherwise."""
+        """Which part of the map each point searches; all of it unless overridden."""
         return torch.zeros(len(points_world), dtype=torch.int64, device=points_world.device)
 
     @abstractmethod
     def nearest(self, points_world: Float[Tensor, "n 3"], bins: Int[Tensor, "n"], max_distance_m: float) -> Neighbours:
-        """Look up the nearest point of each point's place; farther ones than `max_distance_m` need not be found."""
+        """Search the nearest map point in each point's bin; points beyond `max_distance_m` need not be found."""
 
     def _followed(self, points_world: Tensor, bins: Tensor, max_distance_m: float, last: Neighbours) -> Neighbours:
-        """Look up only what may have changed."""
+        """Search only for the points whose neighbour may have changed."""
         moved = (points_world - last.queries).norm(dim=1)
         distances = (self.points_at(last.index.clamp(min=0)) - points_world).norm(dim=1)
         distances = torch.where(last.index < 0, max_distance_m, distances.clamp(max=max_distance_m))

@@ -1,4 +1,4 @@
-"""The nearest two of a handful of candidates for each point."""
+"""The nearest two of a few candidates for each point."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class NearestTwo:
-    """The best candidate of each point, and how far off the best and the second best are.
+    """The nearest candidate of each point, and the distances of the nearest two.
 
     Args:
         index: the nearest map point.
@@ -23,7 +23,7 @@ class NearestTwo:
     second_m: Float[Tensor, "n"]
 
     def improved(self, which: Int[Tensor, "m"], by: "NearestTwo") -> "NearestTwo":
-        """The best two of these and, for some points, of others."""
+        """A copy in which some points also have the candidates of another result."""
         first_m, index = self.first_m[which], torch.where(by.first_m < self.first_m[which], by.index, self.index[which])
         second_m = torch.maximum(first_m, by.first_m).minimum(self.second_m[which]).minimum(by.second_m)
         return NearestTwo(
@@ -34,7 +34,7 @@ class NearestTwo:
 
 
 def joined(parts: Sequence[NearestTwo]) -> NearestTwo:
-    """Those of several sets of points behind each other."""
+    """Concatenate results for several sets of points."""
     if len(parts) == 1:
         return parts[0]
     columns = zip(*((part.index, part.first_m, part.second_m) for part in parts), strict=True)
@@ -50,12 +50,12 @@ def nearest_two(
     """Compare the candidates of each point.
 
     Args:
-        coordinates: map points [m], their coordinates apart in memory, as a slice of a longer buffer, too.
+        coordinates: map points [m], each axis contiguous; may be a slice of a longer buffer.
         candidates: indices of map points.
         points: the points [m].
-        usable: which candidates count, all of them if not given.
+        usable: which candidates count; all of them if not given.
     """
-    # Axis by axis: of all three at once `index_select` would first copy a slice of a buffer.
+    # Axis by axis: of a slice of three rows, `index_select` would first make a contiguous copy.
     flat = candidates.flatten()
     offsets = (
         axis.index_select(0, flat).view_as(candidates).sub_(own[:, None])

@@ -1,4 +1,4 @@
-"""Exact nearest neighbours in the aggregated map."""
+"""Exact nearest neighbours by a KdTree."""
 
 import numpy as np
 import torch
@@ -17,9 +17,9 @@ _LEAF_SIZE = 32  # points; smaller leaves take longer to build, and no less to s
 
 
 class KdTree(VoxelMapAssociation):
-    """The nearest point of the aggregated map by a KdTree (scipy's), rebuilt once per inserted scan.
+    """The nearest point of a voxel map by scipy's KdTree, rebuilt once per inserted scan.
 
-    The tree is built and searched on the CPU, wherever the map is.
+    The tree is built and searched on the CPU, also where the map is on a GPU.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood", Kd-F2M.
     """

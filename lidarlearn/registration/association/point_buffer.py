@@ -1,4 +1,4 @@
-"""The points of the last scans in one piece of memory."""
+"""A growing buffer for the points of the last scans."""
 
 import torch
 from jaxtyping import Float, Int
@@ -13,15 +13,15 @@ _INITIAL_CAPACITY_ON_GPU = (
 
 
 class PointBuffer:
-    """Points and normals of the last scans, oldest first: a new scan is written behind the others, none is moved.
+    """Points and normals of the last scans in one growing buffer, oldest first.
 
-    Coordinates lie apart in memory: projections and distances are computed axis by axis. Forgetting moves the start of
-    a slice; only when the end of the buffers is reached, once in many scans, what is left moves to their front.
+    Adding appends, forgetting advances the start; when the buffer is full, what is left moves to its front. Each axis
+    is contiguous in memory, as projections and distances are computed axis by axis.
 
     Attributes:
         slot_coordinates: coordinates (3, capacity) by slot, those of forgotten points and of free slots included.
         origin: the slot of the first point, a number on the device.
-        recordings: of functions that read the buffers where they are.
+        recordings: of functions that read this memory; forgotten when it is replaced.
 
     Args:
         device: where the points are kept.
@@ -43,20 +43,20 @@ class PointBuffer:
 
     @property
     def coordinates(self) -> Float[Tensor, "3 n"]:
-        """The same, each coordinate of all points in one piece."""
+        """All points [m], each axis contiguous."""
         return self.slot_coordinates[:, self._start : self._end]
 
     @property
     def normals(self) -> Float[Tensor, "n 3"]:
-        """Their unit normals, zero where undefined."""
+        """Unit normals of the points, zero where undefined."""
         return self._normals[self._start : self._end]
 
     def points_at(self, index: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
-        """Some of `points`, by their index."""
+        """`points[index]`."""
         return self.slot_coordinates.index_select(1, index + self.origin).mT.contiguous()
 
     def normals_at(self, index: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
-        """Some of `normals`, by their index."""
+        """`normals[index]`."""
         return self._normals.index_select(0, index + self.origin)
 
     @property
@@ -68,8 +68,8 @@ class PointBuffer:
         """Number of scans."""
         return len(self._lengths)
 
-    def push(self, coordinates: Float[Tensor, "3 m"], normals: Float[Tensor, "m 3"]) -> int:
-        """Add a scan; returns by how much all others have moved to the front of the buffers."""
+    def append(self, coordinates: Float[Tensor, "3 m"], normals: Float[Tensor, "m 3"]) -> int:
+        """Append a scan; returns by how many slots all others moved to the front."""
         new, moved = self._allocate(coordinates.shape[1])
         self.slot_coordinates[:, new] = coordinates
         self._normals[new] = normals
@@ -78,37 +78,35 @@ class PointBuffer:
 
     @property
     def scans(self) -> Int[Tensor, "n"]:
-        """Which scan each point comes from, 0 for the oldest."""
+        """The scan of each point, 0 for the oldest."""
         return self._scans[self._start : self._end] - self.oldest_scan
 
     def at(self, slots: Int[Tensor, "m"]) -> tuple[Float[Tensor, "3 m"], Int[Tensor, "m"]]:
-        """Coordinates of the points in some slots, and the number of the scan each comes from."""
+        """Coordinates of the points in some slots, and the number of each one's scan."""
         return self.slot_coordinates[:, slots], self._scans[slots]
 
     @property
     def oldest_scan(self) -> int:
-        """Number of the oldest scan that is left, counted from the first there was."""
+        """Number of the oldest scan that is left; the first one ever added has number 0."""
         return self._forgotten
 
-    def forget(self, scans: int) -> int:
-        """Keep the last `scans` scans at most; returns how many points are forgotten."""
-        start = self._start
+    def forget(self, scans: int) -> None:
+        """Keep at most the last `scans` scans."""
         while len(self._lengths) > scans:
             self._start += self._lengths.pop(0)
             self._forgotten += 1
         self.origin.fill_(self._start)
-        return self._start - start
 
     @property
     def _capacity(self) -> int:
         return len(self._normals)
 
     def _allocate(self, count: int, spare: int = 0) -> tuple[slice, int]:
-        """Where the points of a new scan will stand in the buffers, and by how much the others have moved to the front.
+        """The slots for a new scan, and by how many slots the others moved to the front to make room.
 
         Args:
-            count: how many they are.
-            spare: how many more slots behind them may be written to.
+            count: number of its points.
+            spare: number of further slots that must exist behind them.
         """
         moved = 0
         if self._end + count + spare > self._capacity:
@@ -120,7 +118,7 @@ class PointBuffer:
         return new, moved
 
     def _move_to_front(self, needed: int) -> None:
-        """Of these buffers or, where they would soon be full again, of larger ones."""
+        """Move all points to the front, of larger buffers if these would soon be full again."""
         count = self._end - self._start
         living = [rows[self._start : self._end].clone() for rows in self._buffers()]
         if 2 * (count + needed) > self._capacity:
@@ -131,7 +129,7 @@ class PointBuffer:
         self.origin.zero_()
 
     def _buffers(self) -> tuple[Tensor, ...]:
-        """The buffers, one row a point."""
+        """All buffers, one row a slot."""
         return self.slot_coordinates.mT, self._normals, self._scans
 
     def _reserve(self, capacity: int) -> None:

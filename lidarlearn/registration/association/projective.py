@@ -23,18 +23,18 @@ _PADDING, _MAP_PADDING = Padding(), Padding(least=1 << 19)
 
 
 class Projective(Association):
-    """The closest in 3D among the map points that share a query point's pixel in an image taken by the sensor.
+    """The closest in 3D among the map points that share a query point's pixel of the spherical image.
 
-    Each scan is kept as the points and normals of its vertex map, and projected into one image, a layer of its own: the
-    candidates of a query are the layers of one pixel. The image is that of the last scan or, with distances between
-    images, of a scan from which the sensor has hardly moved: until it has, only new scans are projected.
+    Each scan is kept as the points and normals of its vertex map, and projected into a layer of one image: the
+    candidates of a query are the layers of its pixel. The image has the pose of the last scan or, with a distance
+    between images, that of an earlier scan close by; until the sensor has moved farther, only new scans are projected.
 
     Args:
         projection: the image, 64x720 px for the HDL-64.
         device: where the map is kept and searched.
-        image_distance_m: a scan begins a new image at this distance from the place of the last one [m]...
-        image_tilt_deg: ...or tilted by this angle against it [deg]. With a distance of 0 every scan begins one, as in
-            the paper.
+        image_distance_m: a scan starts a new image at this distance from the pose of the last image [m]...
+        image_tilt_deg: ...or tilted by this angle against it [deg]. With a distance of 0 every scan does, as in the
+            paper.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood", P-F2M.
     """
@@ -71,24 +71,24 @@ class Projective(Association):
 
     @property
     def recordings(self) -> Recordings:
-        """Of functions that search in this map."""
+        """Recordings of functions that search this map."""
         return self._buffer.recordings
 
     def points_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Some of `points`, by their index."""
+        """`points[index]`."""
         return self._buffer.points_at(index)
 
     def normals_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Some of `normals`, by their index."""
+        """`normals[index]`."""
         return self._buffer.normals_at(index)
 
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
-        """Add a registered scan, and project it or, into a new image, the whole map."""
+        """Add a registered scan, and project it into the image, or the whole map into a new image."""
         vertices, normals, is_used = self._recorded(self._surface, points, T_world_lidar, padding=_PADDING)
         used = is_used.nonzero()[:, 0]
         self._buffer.forget(frames - 1)
-        moved = self._buffer.push(vertices.index_select(1, used), normals.index_select(1, used).mT)
-        if self._begins_image(T_world_lidar, frames):
+        moved = self._buffer.append(vertices.index_select(1, used), normals.index_select(1, used).mT)
+        if self._starts_image(T_world_lidar, frames):
             self._T_image_world.copy_(se3.inverse(T_world_lidar))
             self._layers.copy_(self._project(frames))
             self._next_layer = len(self._buffer) % frames
@@ -105,14 +105,14 @@ class Projective(Association):
     def _surface(
         self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"]
     ) -> tuple[Float[Tensor, "3 pixels"], Float[Tensor, "3 pixels"], Bool[Tensor, "pixels"]]:
-        """Points of a scan's pixels and their normals, in the map's frame, and which of them there are."""
+        """A scan's vertex map and normal map in the map's frame, and which pixels have a normal."""
         vertices = self.projection.vertex_map(points)
         normals = normal_map(vertices).flatten(1)
         R = T_world_lidar[:3, :3].to(normals)
         return _moved(T_world_lidar, vertices.flatten(1)), R @ normals, (normals != 0).any(dim=0)
 
     def reach_m(self, max_distance_m: float) -> float:
-        """All that is in a pixel is looked at."""
+        """Unlimited: all layers of a pixel are compared anyway."""
         return math.inf
 
     def bins(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
@@ -120,7 +120,7 @@ class Projective(Association):
         return self.projection.pixel_index(se3.transform(self._T_image_world, points_world))
 
     def nearest(self, points_world: Float[Tensor, "n 3"], bins: Int[Tensor, "n"], max_distance_m: float) -> Neighbours:
-        """The closest map point of each pixel."""
+        """The closest map point among the layers of each point's pixel."""
         candidates = self._layers.index_select(0, bins.clamp(min=0))
         nothing = (candidates < self._buffer.origin) | (bins < 0)[:, None]
         candidates.clamp_(min=self._buffer.origin)
@@ -128,8 +128,8 @@ class Projective(Association):
         index = torch.where(nearest.first_m < torch.inf, nearest.index - self._buffer.origin, -1)
         return Neighbours(points_world, bins, index, nearest.second_m)
 
-    def _begins_image(self, T_world_lidar: Float[Tensor, "4 4"], frames: int) -> bool:
-        """Whether a scan sees the map from elsewhere than the image does, or there is none with so many layers."""
+    def _starts_image(self, T_world_lidar: Float[Tensor, "4 4"], frames: int) -> bool:
+        """Whether a scan is too far from the image's pose, or the image has another number of layers."""
         if self._layers.shape[1] != frames:
             self._layers = self._layers.new_empty(self.projection.pixels, frames)
             self.recordings.forget()
@@ -140,7 +140,7 @@ class Projective(Association):
         return distance_m >= self._image_distance_m or tilt_deg >= self._image_tilt_deg or len(self._buffer) == 1
 
     def _project(self, layers: int) -> Int[Tensor, "pixels layers"]:
-        """Slot in the buffer of the nearest point of each scan in each pixel, a layer for each; -1 for none."""
+        """Slot of the nearest point of each scan in each pixel, a layer a scan; -1 for none."""
         if not cuda_graphs.are_used_on(self._device):
             return self._nearest_slots(self._buffer.coordinates, self._buffer.scans, layers)
         count = _MAP_PADDING.length(len(self.points))
@@ -149,7 +149,7 @@ class Projective(Association):
         return self.recordings(project, numbers, device=self._device, settings=("_project", count, layers))
 
     def _project_recorded(self, count: int, layers: int, numbers: Int[Tensor, "2"]) -> Int[Tensor, "pixels layers"]:
-        """The same of a number of points that is recorded, some of them twice."""
+        """The same for a padded number of points, some of which are repeated."""
         points, oldest_scan = numbers
         slots = self._buffer.origin + torch.arange(count, device=self._device) % points
         coordinates, scans = self._buffer.at(slots)
@@ -159,14 +159,14 @@ class Projective(Association):
         self, coordinates: Float[Tensor, "3 m"], scans: Int[Tensor, "m"], layers: int
     ) -> Int[Tensor, "pixels layers"]:
         local = _moved(self._T_image_world, coordinates).mT
-        # One pixel more, in front, for the points that fall into none.
+        # One pixel more, in front, for points outside the image.
         bins = self.projection.pixel_index(local).add_(1).mul_(layers).add_(scans)
         nearest = nearest_per_bin(bins, squared_ranges(local), (self.projection.pixels + 1) * layers)
         nearest = nearest[layers:].unflatten(0, (self.projection.pixels, layers))
         return torch.where(nearest < 0, -1, nearest + self._buffer.origin)
 
     def _layer(self, coordinates: Float[Tensor, "3 m"], is_used: Bool[Tensor, "m"]) -> Int[Tensor, "pixels"]:
-        """Which of a scan's used points, counted from 0, is the nearest in each pixel of the image; -1 for none."""
+        """Number of the nearest used point of a scan in each pixel of the image; -1 for none."""
         local = _moved(self._T_image_world, coordinates).mT
         bins = torch.where(is_used, self.projection.pixel_index(local), -1).add_(1)
         nearest = nearest_per_bin(bins, squared_ranges(local), self.projection.pixels + 1)[1:]
@@ -175,6 +175,6 @@ class Projective(Association):
 
 
 def _moved(T: Float[Tensor, "4 4"], coordinates: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
-    """Points whose coordinates lie apart in memory, as projections and distances like them, and stay apart."""
+    """Transformed points; each axis is contiguous before and after."""
     T = T.to(coordinates)
     return torch.addmm(T[:3, 3:], T[:3, :3], coordinates)

@@ -1,4 +1,4 @@
-"""Nearest neighbours by looking into the voxels around a point."""
+"""Nearest neighbours by searching the voxels around a point."""
 
 import math
 
@@ -15,32 +15,32 @@ from lidarlearn.registration.association.voxel_map_association import VoxelMapAs
 
 _MAX_CANDIDATES_AT_ONCE = 1 << 19  # bounds the memory of a wide search
 _MAX_CANDIDATES_AT_ONCE_ON_GPU = 1 << 22
-_CHEAP_CANDIDATES = 1 << 16  # are compared sooner than it is found out which points need a wider search
-_MIN_RADIUS = 2  # voxels; points without a neighbour are searched again only after they moved into this range
+_CHEAP_CANDIDATES = 1 << 16  # are compared faster than the points that need a wider search are selected
+_MIN_RADIUS = 2  # voxels; wide enough that points without a neighbour need no new search in every iteration
 _MAX_RADIUS = 4  # voxels; a search visits 9^3 of them per point
 
 
 class VoxelHash(VoxelMapAssociation):
-    """The nearest point among the voxels around the query: exact within the search distance, up to four voxel edges.
+    """The nearest point in the voxels around the query: exact within the search distance, up to four voxel edges.
 
-    Nothing is built per scan: the table of the aggregated map is the search structure. It runs on tensors alone, on
-    the CPU and on CUDA.
+    Nothing is built per scan, as the table of the voxel map is the search structure. It is made of tensor operations,
+    for CPU and GPU.
 
     Source: the option that Dellenbach et al. 2021, III-A "Local map and neighborhood", names as the way to be faster.
     """
 
     @property
     def recordings(self) -> Recordings:
-        """Of functions that search in this map."""
+        """Recordings of functions that search this map."""
         return self._map.recordings
 
     def reach_m(self, max_distance_m: float) -> float:
-        """One of three: one voxel and a half, two, or as many as are ever looked at."""
+        """One of three: 1.5 voxels, 2 voxels, or unlimited."""
         reaches = (voxels * self._voxel_size_m for voxels in (1.5, _MIN_RADIUS))
         return next((reach_m for reach_m in reaches if max_distance_m <= reach_m), math.inf)
 
     def nearest(self, points_world: Float[Tensor, "n 3"], bins: Int[Tensor, "n"], max_distance_m: float) -> Neighbours:
-        """The nearest point in wider and wider cubes of voxels around each point, until none can be nearer."""
+        """Search wider and wider cubes of voxels around each point, until no other point can be nearer."""
         if cuda_graphs.are_used_on(points_world.device):
             return self._nearest_at_once(points_world, bins, max_distance_m)
         widest = max(_MIN_RADIUS, min(math.ceil(max_distance_m / self._voxel_size_m), _MAX_RADIUS))
@@ -57,12 +57,12 @@ class VoxelHash(VoxelMapAssociation):
         return Neighbours(points_world, bins, index, torch.minimum(found.second_m, searched_m))
 
     def _within(self, points: Float[Tensor, "n 3"], radius: int, inner: int = -1) -> NearestTwo:
-        """The nearest of a cube of voxels around each point, see `VoxelMap.around`."""
+        """The nearest two points of a cube of voxels around each point, see `VoxelMap.around`."""
         chunks = points.split(max(_MAX_CANDIDATES_AT_ONCE // (2 * radius + 1) ** 3, 1))
         return joined([nearest_two(self._map.slot_coordinates, self._map.around(c, radius, inner), c) for c in chunks])
 
     def _nearest_at_once(self, points_world: Tensor, bins: Tensor, max_distance_m: float) -> Neighbours:
-        """The same in the cube of voxels that the distance reaches, without asking what was found on the way."""
+        """Search all voxels within the distance, without reading intermediate results."""
         reach_m = min(max_distance_m, _MAX_RADIUS * self._voxel_size_m)
         candidates = voxels_reached(reach_m, self._voxel_size_m) ** 3
         chunks = points_world.split(max(_MAX_CANDIDATES_AT_ONCE_ON_GPU // candidates, 1))

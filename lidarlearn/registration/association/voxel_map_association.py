@@ -1,4 +1,4 @@
-"""Maps that aggregate the last scans, one point per voxel."""
+"""The part that associations with a voxel map share."""
 
 import torch
 from jaxtyping import Float, Int
@@ -10,10 +10,10 @@ from lidarlearn.registration.association.voxel_map import VoxelMap
 
 
 class VoxelMapAssociation(Association):
-    """An association with the points of the last scans aggregated.
+    """An association whose map is a `VoxelMap`; subclasses add the search.
 
     Args:
-        voxel_size_m: edge of the voxels, which hold one point each [m].
+        voxel_size_m: edge of the voxels; each holds one point [m].
         device: where the map is kept.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood".
@@ -33,11 +33,11 @@ class VoxelMapAssociation(Association):
         self._map.insert(se3.transform(T_world_lidar, points), frames)
 
     def points_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Some of `points`, by their index."""
+        """`points[index]`."""
         return self._map.points_at(index)
 
     def normals_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-        """Some of `normals`, by their index."""
+        """`normals[index]`."""
         return self._map.normals_at(index)
 
     @property
