@@ -8,13 +8,12 @@ from typing import NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, InstantiationException, OverrideParseException
+from hydra.errors import InstantiationException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
 from lidarlearn.commands.configs import config_directory
-from lidarlearn.commands.mistakes import explanation, require_parts
+from lidarlearn.commands.mistakes import explanation, is_mistake, require_parts
 from lidarlearn.errors import UserError
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -99,7 +98,7 @@ def readable_message(error: Exception, config_name: str, arguments: Sequence[str
     if isinstance(error, OverrideParseException):
         remedy = "a value with '=', ',' or spaces needs quotes: 'ckpt=\"a=b.ckpt\"'"
         return f"{error.override}: {error.message.splitlines()[0]}; {remedy}"
-    if isinstance(error, HydraException | OmegaConfBaseException):
+    if is_mistake(error):
         return explanation(error, config_name, sys.argv[1:] if arguments is None else arguments)
     return None
 

@@ -7,6 +7,7 @@ from pathlib import PurePosixPath
 
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -17,18 +18,29 @@ from lidarlearn.errors import UserError
 _OTHER_PROGRAM = {"train": "evaluate.py", "evaluate": "train.py"}
 _LEAST_LIKENESS = 0.6  # of what is worth a question
 
+_NO_OPTION = "Config group override must be"  # a ValueError, unlike all else that Hydra has to say
 
-def explanation(error: HydraException | OmegaConfBaseException, program: str, arguments: Sequence[str]) -> str:
+
+def is_mistake(error: Exception) -> bool:
+    """Whether it is what Hydra says about a command line that it cannot make a configuration of."""
+    return isinstance(error, HydraException | OmegaConfBaseException) or (
+        isinstance(error, ValueError) and str(error).startswith(_NO_OPTION)
+    )
+
+
+def explanation(error: Exception, program: str, arguments: Sequence[str]) -> str:
     """What is wrong, and what may have been meant.
 
     Args:
-        error: raised while the configuration was composed.
+        error: raised while the configuration was composed: `is_mistake`.
         program: name of the primary config.
         arguments: the command line, without the program's name.
     """
     text = str(error).partition("\nConfig search path:")[0]
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
         return _unknown_option(error.missing_cfg_file, error.options)
+    if text.startswith(_NO_OPTION):
+        return _no_option(arguments) or text
     if re.match(r"In 'experiment/.*': Could not override", text) and program in _OTHER_PROGRAM:
         return f"{text}\n  change: that experiment is for {_OTHER_PROGRAM[program]}"
     key = re.search(r"Could not (?:override|delete from config\.) '(.*?)'|config group '(.*)' does not exist", text)
@@ -80,6 +92,18 @@ def _unknown_option(path: str, options: Sequence[str]) -> str:
     beside = [other for other in known if PurePosixPath(other).parent == PurePosixPath(option).parent]
     similar = [f"{group}={other}" for other in nearest(option, known)]
     return "\n    ".join([f"there is no {group}={option}{_question(similar)}\n  options:", *(beside or options)])
+
+
+def _no_option(arguments: Sequence[str]) -> str | None:
+    """A group is given what is no name of an option, such as null; None where it is none of ours."""
+    for argument in arguments:
+        if "=" in argument and not argument.startswith("-"):
+            override = OverridesParser.create().parse_override(argument)
+            is_name = override.is_sweep_override() or isinstance(override.value(), str | list | dict)
+            if not is_name and (config_directory() / override.key_or_group).is_dir():
+                unknown = _unknown_option(f"{override.key_or_group}/{override.get_value_string()}", ())
+                return f"{unknown}\n  change: choose one of these, or leave {argument} out"
+    return None
 
 
 def _question(names: Sequence[str]) -> str:

@@ -35,6 +35,9 @@ def run(monkeypatch, tmp_path, *arguments, task=lambda config: None, program="tr
         ("experiment=paper/kitty", ["did you mean experiment=paper/kitti?", "\n    paper/failures\n"]),
         ("experiment=paper/kitti", ["change: that experiment is for evaluate.py"]),
         ("logger@trainer.logger=x", ["logger@trainer.logger"]),
+        ("loss=null", ["no loss=null\n", "\n    supervised\n", "change: choose one of these, or leave loss=null out"]),
+        ("+loss@module.loss=3", ["no loss=3\n", "or leave +loss@module.loss=3 out"]),
+        ("experiment=null", ["no experiment=null\n", "\n    kitti_04_mapping\n", "or leave experiment=null out"]),
     ],
 )
 def test_a_typo_is_a_readable_message(monkeypatch, tmp_path, capsys, argument, words):
