@@ -69,13 +69,18 @@ def train(config: DictConfig, data_name: str) -> Path:
     return best if best.exists() else best.with_name("last.ckpt")
 
 
-def evaluate_command(
-    checkpoint: Path, overrides: Sequence[str] = (), config_folder: str | None = None, is_data_told: bool = True
+def command_with(
+    checkpoint: Path,
+    program: str,
+    overrides: Sequence[str] = (),
+    config_folder: str | None = None,
+    is_data_told: bool = True,
 ) -> str:
-    """The command that evaluates a checkpoint, as it can be pasted into a shell.
+    """The command that evaluates a checkpoint or goes on from it, as it can be pasted into a shell.
 
     Args:
         checkpoint: the file.
+        program: evaluate or train.
         overrides: of its training; where the data lie is told anew, since a checkpoint does not say.
         config_folder: of the user's own options, from which its data may come.
         is_data_told: whether the checkpoint tells the rest of its data. What is read by a class from elsewhere, which a
@@ -84,25 +89,47 @@ def evaluate_command(
     path = str(checkpoint.relative_to(Path.cwd()) if checkpoint.is_relative_to(Path.cwd()) else checkpoint)
     if not _PLAIN_CHARACTERS.issuperset(path):
         path = quoted(path)  # for Hydra; the shell's quotes come around it
-    program = "python evaluate.py" if Path("evaluate.py").is_file() else "lidarlearn-evaluate"
+    start = f"python {program}.py" if Path(f"{program}.py").is_file() else f"lidarlearn-{program}"
     arguments = [] if config_folder is None else ["--config-dir", config_folder]  # behind it more can be added
     told_anew = ("data.root=",) if is_data_told else ("data=", "data.", "projection@data.")
     arguments += [f"ckpt={path}", *(override for override in overrides if override.startswith(told_anew))]
-    return f"{program} {shlex.join(arguments)}"
+    return f"{start} {shlex.join(arguments)}"
 
 
 def _train_and_say_what_next(config: DictConfig) -> None:
-    _say_what_next(train(config, chosen_data(config)).resolve(), config)
+    try:
+        checkpoint = train(config, chosen_data(config))
+    except SystemExit:  # Lightning's way to end at SIGINT and at SIGTERM, at the latter with 0 as if all were done
+        _say_how_to_go_on(config)
+        sys.exit(1)
+    _say_what_next(checkpoint.resolve(), config)
 
 
 @rank_zero_only
 def _say_what_next(checkpoint: Path, config: DictConfig) -> None:
     if checkpoint.exists():
-        print(f"\ncheckpoint: {checkpoint}\ncurves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
-        hydra = HydraConfig.get()
-        folder = next((place.path for place in hydra.runtime.config_sources if place.provider == "command-line"), None)
-        is_data_told = config.data["_target_"].startswith(TRUSTED_PACKAGES)
-        print(f"next:       {evaluate_command(checkpoint, hydra.overrides.task, folder, is_data_told)}")
+        print(f"\ncheckpoint: {checkpoint}")
+        if any(Path(config.run_dir).rglob("events.out.tfevents*")):
+            print(f"curves:     tensorboard --logdir {shlex.quote(str(config.run_dir))}")
+        print(f"next:       {_command_as_here(checkpoint, 'evaluate', config)}")
+
+
+@rank_zero_only
+def _say_how_to_go_on(config: DictConfig) -> None:
+    last = Path(config.run_dir).resolve() / "checkpoints" / "last.ckpt"
+    if last.exists():
+        print(f"\ninterrupted: the last whole epoch is in {last}")
+        print(f"go on:       {_command_as_here(last, 'train', config)}")
+    else:
+        print("\ninterrupted before the end of an epoch: there is no new checkpoint")
+
+
+def _command_as_here(checkpoint: Path, program: str, config: DictConfig) -> str:
+    """The command for the data of this run, as this machine has them."""
+    hydra = HydraConfig.get()
+    folder = next((place.path for place in hydra.runtime.config_sources if place.provider == "command-line"), None)
+    is_data_told = config.data["_target_"].startswith(TRUSTED_PACKAGES)
+    return command_with(checkpoint, program, hydra.overrides.task, folder, is_data_told)
 
 
 def _require_workable(config: DictConfig) -> None:
@@ -133,6 +160,11 @@ def _require_workable(config: DictConfig) -> None:
         raise UserError(
             f"trainer.val_check_interval={trainer.val_check_interval}: the best checkpoint is chosen among whole epochs"
             "\n  change: trainer.check_val_every_n_epoch, or trainer.limit_train_batches for shorter epochs"
+        )
+    savers = [f"~callbacks.{name}" for name in ("last_checkpoint", "best_checkpoint") if name in config.callbacks]
+    if trainer.enable_checkpointing is False and savers:
+        raise UserError(
+            f"trainer.enable_checkpointing=false: nothing may save checkpoints\n  change: add {' '.join(savers)}"
         )
     if not trainer.logger and "learning_rate" in config.callbacks:
         raise UserError("trainer.logger=false: nothing takes the learning rate\n  change: add ~callbacks.learning_rate")

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -11,11 +12,12 @@ from pathlib import Path
 
 import pytest
 from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from lidarlearn.commands import run_folder, train
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.run_folder import git_revision
-from lidarlearn.commands.train import evaluate_command
+from lidarlearn.commands.train import command_with
 from lidarlearn.training.checkpoints import load_checkpoint
 from tests.training.runs import configured, curves
 
@@ -56,8 +58,11 @@ def test_the_revision_is_a_commit_or_unknown():
 def test_the_command_that_is_printed_knows_where_the_data_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     overrides = ["data=folder", "data.root=/my scans", "trainer.max_epochs=1", "data.max_frames=9"]
-    assert evaluate_command(tmp_path / "a.ckpt", overrides) == "lidarlearn-evaluate ckpt=a.ckpt 'data.root=/my scans'"
-    told = evaluate_command(tmp_path / "a.ckpt", overrides, is_data_told=False)
+    assert (
+        command_with(tmp_path / "a.ckpt", "evaluate", overrides)
+        == "lidarlearn-evaluate ckpt=a.ckpt 'data.root=/my scans'"
+    )
+    told = command_with(tmp_path / "a.ckpt", "evaluate", overrides, is_data_told=False)
     assert told == "lidarlearn-evaluate ckpt=a.ckpt data=folder 'data.root=/my scans' data.max_frames=9"
 
 
@@ -82,9 +87,10 @@ def test_the_revision_is_not_that_of_a_project_with_lidarlearn_in_its_environmen
 )
 def test_the_command_that_is_printed_survives_shell_and_hydra(path, printed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert evaluate_command(tmp_path / path) == f"lidarlearn-evaluate {printed}"
+    assert command_with(tmp_path / path, "evaluate") == f"lidarlearn-evaluate {printed}"
+    assert command_with(tmp_path / path, "train") == f"lidarlearn-train {printed}"
     (tmp_path / "evaluate.py").touch()
-    assert evaluate_command(tmp_path / path) == f"python evaluate.py {printed}"
+    assert command_with(tmp_path / path, "evaluate") == f"python evaluate.py {printed}"
 
 
 def test_a_later_process_takes_the_checkpoints_of_the_first_for_its_own(tmp_path, monkeypatch):
@@ -111,6 +117,18 @@ def test_the_command_that_is_printed_finds_the_options_of_the_user(tmp_path, mon
     assert f"--config-dir '{tmp_path}/my configs' ckpt=" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("events", [True, False])
+def test_curves_are_told_where_there_are_some(tmp_path, monkeypatch, capsys, events):
+    (tmp_path / "best.ckpt").touch()
+    if events:
+        (tmp_path / "run" / "version_0").mkdir(parents=True)
+        (tmp_path / "run" / "version_0" / "events.out.tfevents.1").touch()
+    monkeypatch.setattr(train, "train", lambda *_: tmp_path / "best.ckpt")
+    monkeypatch.setattr(sys, "argv", ["train.py", f"hydra.run.dir={tmp_path}/run"])
+    train.main()
+    assert (f"tensorboard --logdir {tmp_path}/run" in capsys.readouterr().out) == events
+
+
 @pytest.mark.parametrize("rank", [0, 1])
 def test_the_first_process_alone_says_what_is_next(tmp_path, monkeypatch, capsys, rank):
     (tmp_path / "best.ckpt").touch()
@@ -119,6 +137,26 @@ def test_the_first_process_alone_says_what_is_next(tmp_path, monkeypatch, capsys
     monkeypatch.setattr(sys, "argv", ["train.py", f"hydra.run.dir={tmp_path}/run"])
     train.main()
     assert capsys.readouterr().out.count("next:") == (rank == 0)
+
+
+@pytest.mark.parametrize("is_saved", [True, False])
+def test_a_training_that_is_preempted_does_not_look_finished(tmp_path, monkeypatch, capsys, is_saved):
+    last = tmp_path / "run" / "checkpoints" / "last.ckpt"
+
+    def interrupted(*_):
+        last.parent.mkdir(parents=True)
+        if is_saved:
+            last.touch()
+        raise SIGTERMException
+
+    monkeypatch.setattr(train, "train", interrupted)
+    monkeypatch.setattr(sys, "argv", ["train.py", f"hydra.run.dir={tmp_path}/run", "data.root=/my/data"])
+    with pytest.raises(SystemExit) as exit_:
+        train.main()
+    assert exit_.value.code == 1
+    out = capsys.readouterr().out
+    assert "interrupted" in out and "next:" not in out
+    assert (f" ckpt={last} data.root=/my/data" in out) == is_saved
 
 
 @pytest.mark.slow
@@ -162,6 +200,24 @@ def test_a_killed_training_resumes_at_its_epoch(tmp_path):
     assert [int(e) for e in re.findall(rf"epoch +(\d+)/{done + 2} .*100 %", out)] == [done + 1, done + 2]
     after = load_checkpoint(tmp_path / "resumed" / "checkpoints" / "last.ckpt")
     assert after["epoch"] == done + 1 and after["global_step"] == (done + 2) * 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_training_says_how_it_goes_on(tmp_path, how):
+    shown = ("trainer.max_epochs=1000", "callbacks.progress.seconds_between_lines=0")
+    process = subprocess.Popen(
+        command(tmp_path, *shown), env=environment(), cwd=tmp_path, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    next(line for line in process.stdout if re.match(r"epoch +2/1000 \[#+-", line))
+    process.send_signal(how)
+    out, _ = process.communicate()
+    assert process.returncode == 1
+    done = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["epoch"] + 1
+    told = shlex.split(re.search(r"^go on: +lidarlearn-train (.*)$", out, re.MULTILINE)[1])
+    again = call(tmp_path, *told, f"trainer.max_epochs={done + 1}", f"hydra.run.dir={tmp_path}/resumed")
+    assert re.findall(rf"epoch +(\d+)/{done + 1} .*100 %", again) == [str(done + 1)]
 
 
 @pytest.mark.slow

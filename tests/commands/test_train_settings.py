@@ -13,6 +13,8 @@ from tests.training.runs import configured
         (["trainer.precision=bf16-mixed", "trainer.gradient_clip_val=1.0"], r"optimizer\.fused=false"),
         (["trainer.precision=bf16-true"], r"trainer\.precision to one of .*bf16-mixed"),
         (["trainer.logger=false"], "~callbacks.learning_rate"),
+        (["trainer.enable_checkpointing=false"], "~callbacks.last_checkpoint ~callbacks.best_checkpoint$"),
+        (["trainer.enable_checkpointing=false", "~callbacks.best_checkpoint"], "add ~callbacks.last_checkpoint$"),
         (["trainer.max_epochs=-1", "scheduler=cosine"], r"trainer\.max_epochs"),
         (["trainer.max_epochs=null", "trainer.max_time=00:01:00:00", "scheduler=cosine"], r"trainer\.max_epochs"),
         (["trainer.val_check_interval=2"], r"trainer\.check_val_every_n_epoch"),
@@ -31,6 +33,7 @@ def test_they_say_what_to_change(tmp_path, overrides, remedy):
     [
         ["trainer.precision=bf16-mixed", "trainer.gradient_clip_val=1.0", "optimizer.fused=false"],
         ["trainer.logger=false", "~callbacks.learning_rate"],
+        ["trainer.enable_checkpointing=false", "~callbacks.last_checkpoint", "~callbacks.best_checkpoint"],
     ],
 )
 def test_as_changed_they_work(tmp_path, overrides):
