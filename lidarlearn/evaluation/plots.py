@@ -33,6 +33,7 @@ _TRUTH = "#4d4d4d"
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 _STYLES = ("-", "--", ":", "-.")
 _KMH = 3.6
+_LEAST_ERROR = 1e-6  # that a logarithmic axis shows [m] or [deg]: none has no place there, and rounding says nothing
 
 
 def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str, Poses]) -> Figure:
@@ -133,6 +134,8 @@ def speed_figure(title: str, true_kmh: Float[Tensor, "n"], estimated_kmh: Mappin
 def frame_error_figure(title: str, T_true: Poses, T_estimates: Mapping[str, Poses]) -> Figure:
     """Error of every motion between consecutive scans, on a logarithmic scale, with the limits of a failure.
 
+    Smaller errors than 1e-6 m or deg are drawn there.
+
     Args:
         title: what is shown.
         T_true: ground-truth poses.
@@ -144,8 +147,8 @@ def frame_error_figure(title: str, T_true: Poses, T_estimates: Mapping[str, Pose
         errors = relative_errors(T_world, T_true)
         frames = np.arange(1, len(errors.translation) + 1)
         style: dict[str, Any] = {"linewidth": 0.6, "label": method, **_line(i)}
-        upper.plot(frames, _positive(errors.translation), **style)
-        lower.plot(frames, _positive(errors.rotation.rad2deg()), **style)
+        upper.plot(frames, errors.translation.clamp(min=_LEAST_ERROR).cpu(), **style)
+        lower.plot(frames, errors.rotation.rad2deg().clamp(min=_LEAST_ERROR).cpu(), **style)
     for axes, limit in ((upper, MAX_TRANSLATION_M), (lower, MAX_ROTATION_DEG)):
         axes.axhline(limit, color=_TRUTH, linewidth=1, linestyle=(0, (6, 3)), label="failure")
         axes.set_yscale("log")
@@ -248,11 +251,6 @@ def _view(paths: Series[Float[Tensor, "_ 2"]], truth: Float[Tensor, "n 2"] | Non
     missing = (0.4 * extent - (corners[1] - corners[0])).clamp(min=0) / 2  # a straight drive gets some room around it
     margin = 0.05 * extent + missing
     return corners + torch.stack([-margin, margin])
-
-
-def _positive(errors: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
-    """What a logarithmic axis can show: exact zeros become gaps."""
-    return torch.where(errors > 0, errors, torch.nan).cpu()
 
 
 def _all_speeds(sequences: Mapping[str, Sequence], poses: Mapping[str, Poses]) -> Float[Tensor, "_"]:

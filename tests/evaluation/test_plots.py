@@ -95,6 +95,13 @@ def test_frame_errors_mark_failures(make_drive, longer):
     assert lower.get_xlabel() == "scan"
 
 
+def test_frame_errors_that_are_none_or_rounded_lie_at_the_bottom(make_drive):
+    truth = make_drive(40)
+    turned = se3.exp(torch.tensor([0, 0, 0, 0.1, 0.2, 0.3], dtype=torch.float64)) @ truth
+    for axes in frame_error_figure("a", truth, {"same": truth, "turned": turned}).axes:
+        assert all(line.get_ydata().tolist() == [1e-6] * 39 for line in axes.lines[:2])
+
+
 def test_methods_look_different_and_keep_their_look(make_drive):
     T = make_drive(20)
     methods = {f"m{i}": T for i in range(12)}
