@@ -43,7 +43,7 @@ def test_the_widest_search_finds_a_neighbour_wherever_four_edges_reach(both):
 def test_a_search_in_pieces_is_the_search_at_once(both, monkeypatch):
     _, table, queries = both
     whole = table.search(queries, 1.6)
-    monkeypatch.setattr("lidarlearn.registration.association.voxel_hash._CANDIDATES_AT_ONCE", 10_000)
+    monkeypatch.setattr("lidarlearn.registration.association.voxel_hash._MAX_CANDIDATES_AT_ONCE", 10_000)
     pieces = table.search(queries, 1.6)
     assert torch.equal(whole.mask, pieces.mask)
     assert torch.equal(whole.points[whole.mask], pieces.points[whole.mask])
