@@ -109,7 +109,7 @@ def _remedy(network: str, path: str | None) -> str:
     seen = f"networks.{network}: a trained network is needed" if path is None else f"networks.{network}: no file {path}"
     setting = "ckpt" if network == "posenet" and path is None else f"networks.{network}"
     remedy = f"{seen}\n  change: {setting}=RUN/checkpoints/best.ckpt"
-    experiment = f"network/{Path(path or '').parent.parent.name}"  # trains into outputs/networks/<name>/checkpoints
+    experiment = f"network/{Path(path or '').parent.parent.name}"  # trains into outputs/network/<name>/checkpoints
     if (config_directory() / "experiment" / f"{experiment}.yaml").is_file():
         remedy += f", or train it: python train.py experiment={experiment}"
     return remedy

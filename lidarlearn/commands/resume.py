@@ -69,7 +69,7 @@ def add_settings(arguments: list[str], folder: Path) -> None:
         require_trusted({"_target_": checkpoint["module"]} if part == "module" else parts[part], kind)
     of_module = {key: value for key, value in parts.items() if key not in (*_FIXED, "trained_on")}
     require_plain({**settings, **of_module})
-    name, schedule = settings.get("scheduler", OPTION), dict(parts["scheduler"])
+    name = settings.get("scheduler", OPTION)
     of_projection = {key: trained_on["projection"][key] for key in ("height", "width")}
     recipe = {
         "defaults": [*({f"override /{part}": OPTION} for part in chosen), "_self_"],
@@ -77,12 +77,9 @@ def add_settings(arguments: list[str], folder: Path) -> None:
         "datamodule": {**of_projection, **_only(_OF_DATAMODULE, settings.get("datamodule", {}))},
         "trainer": _only(_OF_TRAINER, settings.get("trainer", {})),
         "scheduler": name,
-        "schedulers": {name: schedule},
-        "lr_halving_epochs": schedule.get("milestones", []),
+        "schedulers": {name: parts["scheduler"]},
         **_only(("seed",), settings),
     }
-    if "milestones" in schedule:
-        schedule["milestones"] = "${lr_halving_epochs}"  # by which the command line knows them
     for part in ("model", "loss", "optimizer"):
         write_option(folder, part, parts[part])
     write_option(folder, "recipe", recipe, header=GLOBAL)

@@ -114,7 +114,7 @@ def test_all_networks_that_are_not_there_are_named_before_data_are_made(no_data,
     monkeypatch.chdir(tmp_path)
     error = refused(capsys, "experiment=paper/generalization_sim", "device=cpu")
     for name in ("campus", "urban"):
-        assert f"networks.posenet_{name}: no file outputs/networks/simulated_{name}/checkpoints/best.ckpt" in error
+        assert f"networks.posenet_{name}: no file outputs/network/simulated_{name}/checkpoints/best.ckpt" in error
         assert f"python train.py experiment=network/simulated_{name}" in error
 
 

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard"
 RUN = (
     "data=folder", *SENSOR, "data.train_sequences=['0']", "data.val_sequences=['1']", "data.test_sequences=['1']",
     f"data.max_frames={FRAMES}", "datamodule.batch_size=2", "datamodule.height=16", "loss=icp", "optimizer=adamw",
-    "optimizer.lr=1e-3", "model.rotation_scale=0.2", "lr_halving_epochs=[1]", "seed=7", "trainer.limit_train_batches=2",
+    "optimizer.lr=1e-3", "model.rotation_scale=0.2", "schedulers.step.milestones=[1]", "seed=7", "trainer.limit_train_batches=2",
     "trainer.max_epochs=2",
 )  # fmt: skip
 
@@ -178,7 +178,7 @@ def test_nodes_that_do_not_see_the_settings_are_not_sent_for_them(checkpoint, tm
     [
         ("optimizer.lr=1e-5", r"another optimizer: lr was 0\.001 and is 1e-05"),
         ("optimizer=adam", r"another optimizer: _target_ was torch\.optim\.AdamW"),
-        ("lr_halving_epochs=[1,2]", r"another scheduler: milestones was \[1\]"),
+        ("schedulers.step.milestones=[1,2]", r"another scheduler: milestones was \[1\]"),
         ("scheduler=cosine", "another scheduler"),
         ("schedulers.step.gamma=0.1", "another scheduler: gamma"),
         ("loss=weighted_icp", "another loss: _target_"),
