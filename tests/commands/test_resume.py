@@ -26,8 +26,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard"
 RUN = (
     "data=folder", *SENSOR, "data.train_sequences=['0']", "data.val_sequences=['1']", "data.test_sequences=['1']",
     f"data.max_frames={FRAMES}", "datamodule.batch_size=2", "datamodule.height=16", "loss=icp", "optimizer=adamw",
-    "optimizer.lr=1e-3", "model.rotation_scale=0.2", "schedulers.step.milestones=[1]", "seed=7", "trainer.limit_train_batches=2",
-    "trainer.max_epochs=2",
+    "optimizer.lr=1e-3", "model.rotation_scale=0.2", "schedulers.step.milestones=[1]", "seed=7",
+    "trainer.limit_train_batches=2", "trainer.max_epochs=2",
 )  # fmt: skip
 
 
