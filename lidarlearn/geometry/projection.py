@@ -96,8 +96,3 @@ def nearest_per_bin(
 def activated(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Bool[Tensor, "*batch h w"]:
     """Pixels into which a point fell. Empty pixels are exact zeros in all three coordinates."""
     return (vertex_map != 0).any(dim=-3)
-
-
-def points_of(vertex_map: Float[Tensor, "3 h w"]) -> Float[Tensor, "n 3"]:
-    """The points of the activated pixels, in row-major order."""
-    return vertex_map[:, activated(vertex_map)].T

@@ -2,17 +2,13 @@
 
 import numpy as np
 from jaxtyping import Float64
-
-_HATS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0.0]])
-_EYE = np.eye(3)
+from scipy.spatial.transform import Rotation
 
 
 def retraction(step: Float64[np.ndarray, "*batch 6"]) -> Float64[np.ndarray, "*batch 4 4"]:
     """The transform of a step: its rotation, then its translation. For small steps it agrees with `se3.exp`."""
-    angle = np.maximum(np.linalg.norm(step[..., 3:], axis=-1), 1e-9)[..., None, None]
-    W = (step[..., 3:] @ _HATS).reshape(*step.shape[:-1], 3, 3)
     T = np.zeros((*step.shape[:-1], 4, 4))
-    T[..., :3, :3] = _EYE + np.sin(angle) / angle * W + (1 - np.cos(angle)) / angle**2 * (W @ W)
+    T[..., :3, :3] = Rotation.from_rotvec(step[..., 3:].reshape(-1, 3)).as_matrix().reshape(*step.shape[:-1], 3, 3)
     T[..., :3, 3] = step[..., :3]
     T[..., 3, 3] = 1
     return T
