@@ -1,6 +1,7 @@
 """A simulated drive: scans in memory, straight from a few settings."""
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -83,7 +84,8 @@ class Drive(Sequence):
         if self._given is not None:
             digest.update(self._given.tobytes())
         if self._own is not None:
-            digest.update(self._own.static.vertices.tobytes())
+            for array in _arrays(self._own):
+                digest.update(repr((array.shape, array.dtype)).encode() + array.tobytes())
         return digest.hexdigest()[:16]
 
     def __getstate__(self) -> dict[str, object]:
@@ -185,6 +187,14 @@ class Drive(Sequence):
 def simulator_digest() -> str:
     """Hash of the code that scans depend on: this module and those of the simulator that it uses."""
     return source_digest(Path(__file__), within=_SIMULATOR)
+
+
+def _arrays(world: World) -> Iterator[np.ndarray]:
+    """All that a world consists of."""
+    for mesh in (world.static, *(mover.mesh for mover in world.movers)):
+        yield from (mesh.vertices, mesh.triangles)
+    for mover in world.movers:
+        yield from (mover.lane, mover.times, mover.way)
 
 
 def _seen(

@@ -205,6 +205,18 @@ def test_the_fingerprint_knows_every_setting(change):
     assert Drive("urban", **settings).fingerprint != Drive("urban", **(settings | change)).fingerprint
 
 
+def test_the_fingerprint_knows_all_of_a_world_of_ones_own():
+    ground, lane, times = box(80.0, 80.0, 0.1, base=-1.8), np.array([[5.0, -30, -1.7], [5, 30, -1.7]]), np.arange(3.0)
+    bus = Mover(box(3.0, 3.0, 3.0), lane, times, 30 + times)
+    worlds = [World(ground), World(replace(ground, triangles=ground.triangles[:6])), World(ground, (bus,))]
+    changes = ({"mesh": box(3.0, 3.0, 2.0)}, {"lane": lane + 1}, {"times": times + 1}, {"way": times})
+    worlds += [World(ground, (replace(bus, **change),)) for change in changes]
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    fingerprints = [Drive(world, poses=poses, sensor=SENSOR).fingerprint for world in worlds]
+    assert len(set(fingerprints)) == len(worlds)
+    assert Drive(World(ground, (replace(bus),)), poses=poses, sensor=SENSOR).fingerprint == fingerprints[2]
+
+
 def test_the_fingerprint_knows_the_simulator(monkeypatch):
     before = Drive("urban", seed=0, frames=5, sensor=SENSOR).fingerprint
     monkeypatch.setattr("lidarlearn.simulation.drive.source_digest", lambda *files, within: "of other code")
