@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from lidarlearn.data.sequence import Sequence
 from lidarlearn.errors import UserError
+from lidarlearn.evaluation.figure import Figure
 from lidarlearn.evaluation.plots import Panel, curves_figure
 from lidarlearn.evaluation.tables import Table
 from lidarlearn.geometry import se3

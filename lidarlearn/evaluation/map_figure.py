@@ -8,12 +8,11 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patheffects import withStroke
 from torch import Tensor
 
-from lidarlearn.evaluation.plots import finish
+from lidarlearn.evaluation.figure import Figure, finish, hold_names
 from lidarlearn.geometry.voxels import voxel_cells
 
 _DPI = 150
@@ -42,7 +41,7 @@ def map_figure(
     axes = figure.add_subplot()
     image = draw_map(axes, points, pixel_m, T_estimates, T_true)
     axes.set(xlim=(float(lower[0]), float(upper[0])), ylim=(float(lower[1]), float(upper[1])))
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     finish(axes, "", "x, forward at the start [m]", "y, left at the start [m]")
     figure.colorbar(image, label="height above the first pose [m]", extend="both", shrink=0.7, aspect=40, pad=0.01)
     return figure
@@ -73,7 +72,7 @@ def draw_map(
         axes.plot(*T[:, :2, 3].mT.numpy(), color="#d55e00", linewidth=2, path_effects=outlined, label=method)
     if T_true is not None:
         axes.plot(*T_true[:, :2, 3].mT.numpy(), color="black", linewidth=1, linestyle="--", label="ground truth")
-    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False, borderaxespad=0.2)
+    hold_names(axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False, borderaxespad=0.2))
     return image
 
 

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from lidarlearn.data.sequence import Sequence
+from lidarlearn.evaluation.figure import Figure, finish, legend_beside
 from lidarlearn.evaluation.score import Score, pool_by_length
 from lidarlearn.geometry import se3
 from lidarlearn.metrics.failures import MAX_ROTATION_DEG, MAX_TRANSLATION_M
@@ -27,7 +27,7 @@ from lidarlearn.metrics.relative import relative_errors, speeds
 
 Poses = Float[Tensor, "n 4 4"]
 
-_DPI, _LINE_INCHES = 120, 0.215  # of a legend
+_DPI = 120
 _TRUTH = "#4d4d4d"
 # Okabe and Ito's palette, told apart with any colour vision; the line style changes when it is used up.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
@@ -56,7 +56,7 @@ def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str
         axes.plot(*path.mT.numpy(), linewidth=1.5, label=method, **_line(i))
     axes.plot(0, 0, marker="o", markersize=7, color="black", linestyle="none", label="start", zorder=5)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-    _legend_beside(figure, axes)
+    legend_beside(figure, axes)
     finish(axes, title, "x, forward at the start [m]", "y, left at the start [m]")
     figure.draw_without_rendering()  # room for the labels is made about axes whose aspect only a first drawing settles
     return figure
@@ -80,7 +80,7 @@ def drift_figure(title: str, averages: Mapping[str, Mapping[int, SegmentAverage]
         axes.set_ylim(bottom=0)
     finish(left, title, "segment length [m]", "translation error [%]")
     finish(right, "", "segment length [m]", "rotation error [deg/100 m]")
-    _legend_beside(figure, left)
+    legend_beside(figure, left)
     return figure
 
 
@@ -102,7 +102,7 @@ def curves_figure(title: str, panels: Series[Panel]) -> Figure:
             axes.plot(list(curve), list(curve.values()), marker="o", markersize=4, label=name, **_line(i))
         axes.set_ylim(bottom=0)
         finish(axes, title if k == 0 else "", panel.x, panel.y)
-    _legend_beside(figure, row[0])
+    legend_beside(figure, row[0])
     return figure
 
 
@@ -125,7 +125,7 @@ def speed_figure(title: str, true_kmh: Float[Tensor, "n"], estimated_kmh: Mappin
     for i, (method, kmh) in enumerate(estimated_kmh.items()):
         _histogram(axes, kmh, edges, histtype="step", linewidth=1.5, label=method, **_line(i))
     axes.set_xlim(edges[0], edges[-1])
-    _legend_beside(figure, axes)
+    legend_beside(figure, axes)
     beyond = " (the last bin holds all beyond)" if len(everything) and float(everything.max()) > edges[-1] else ""
     finish(axes, title, f"speed [km/h]{beyond}", f"share of scans [%] per {edges[1] - edges[0]:g} km/h")
     return figure
@@ -154,7 +154,7 @@ def frame_error_figure(title: str, T_true: Poses, T_estimates: Mapping[str, Pose
         axes.set_yscale("log")
     finish(upper, title, "", "translation error [m]")
     finish(lower, "", "scan", "rotation error [deg]")
-    _legend_beside(figure, upper)
+    legend_beside(figure, upper)
     return figure
 
 
@@ -216,22 +216,6 @@ def _line(index: int) -> dict[str, Any]:
     """Colour and line style of the index-th method, the same in every figure."""
     style = _STYLES[index // len(_COLOURS) % len(_STYLES)]
     return {"color": _COLOURS[index % len(_COLOURS)], "linestyle": style}
-
-
-def finish(axes: Axes, title: str, x: str, y: str) -> None:
-    """Labels and grid as all figures have them."""
-    axes.set_title(title, loc="left")
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.grid(color="0.9", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _legend_beside(figure: Figure, axes: Axes) -> None:
-    """A legend where it hides nothing, on a figure that is high enough; one for axes that show the same methods."""
-    legend = figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
-    figure.set_figheight(max(figure.get_figheight(), _LINE_INCHES * (len(legend.texts) + 1)))
 
 
 def _bird_eye(T_world: Poses) -> Float[Tensor, "n 2"]:

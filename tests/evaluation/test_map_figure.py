@@ -5,8 +5,8 @@ import torch
 from lidarlearn.evaluation.map_figure import map_figure
 
 
-def picture(points, T, T_true=None, pixel_m=0.5):
-    figure = map_figure("a", points, pixel_m, {"m": T}, T_true)
+def picture(points, T, T_true=None, pixel_m=0.5, name="m"):
+    figure = map_figure(name, points, pixel_m, {name: T}, T_true)
     axes = figure.axes[0]
     return figure, axes, axes.images[0]
 
@@ -20,6 +20,12 @@ def test_heights_are_shown_where_they_are(make_drive):
     assert axes.get_aspect() == 1 and "[m]" in axes.get_xlabel() and "[m]" in axes.get_ylabel()
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["m", "ground truth"]
     assert axes.lines[1].get_linestyle() == "--" and "[m]" in figure.axes[1].get_ylabel()
+
+
+@pytest.mark.parametrize("name", ["测试 数据", "a$b_{c$d"])
+def test_names_of_any_kind(make_drive, name, tmp_path):
+    figure, _, _ = picture(torch.ones(1, 3), make_drive(5), name=name)
+    figure.savefig(tmp_path / "a.png")
 
 
 def test_a_large_map_takes_no_larger_picture(make_drive):

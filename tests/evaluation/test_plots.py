@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from lidarlearn.evaluation import figure as figure_module
 from lidarlearn.evaluation.plots import (
     drift_figure,
     figures,
@@ -125,6 +126,26 @@ def test_all_figures_of_an_evaluation_become_files(tmp_path, make_sequence, long
         "trajectories_unknown.png",
     ]
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
+
+
+@pytest.mark.parametrize("name", ["测试 数据", "a$b_{c$d"])
+def test_names_of_any_kind(tmp_path, make_sequence, name):
+    """A letter without a font is no warning, which fails a test, and a formula none that stops an evaluation."""
+    sequence = make_sequence(name, 150)
+    estimates = {name: {name: sequence.T_world_lidar}}
+    scores = [score(name, sequence.T_world_lidar, sequence)]
+    drawn = dict(figures({name: sequence}, estimates, scores))
+    assert len(write_plots(tmp_path, drawn.items())) == 4
+    for figure in drawn.values():
+        assert name in figure.axes[0].get_title(loc="left") and name in legend(figure)
+    errors = drawn[f"frame_errors_{name}"].axes[0].yaxis.get_ticklabels()
+    assert all(label.get_parse_math() for label in errors)  # 10 to the power of something
+
+
+def test_letters_are_looked_for_in_fonts_of_east_asia(monkeypatch, make_drive):
+    monkeypatch.setattr(figure_module, "_EAST_ASIAN", ("of another system", "DejaVu Serif"))
+    figure = trajectory_figure("a", None, {"m": make_drive(5)})
+    assert figure.axes[0].title.get_fontfamily() == ["sans-serif", "DejaVu Serif"]
 
 
 def test_what_cannot_be_drawn_is_left_out(unknown_drive):
