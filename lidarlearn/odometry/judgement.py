@@ -1,5 +1,6 @@
 """The thresholds by which registrations are accepted, doubted and compared."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from lidarlearn.errors import require_positive
@@ -17,6 +18,8 @@ class Judgement:
         min_inlier_share: smallest acceptable share of these points that lie on the map's surface.
         min_fit_share: a registration is doubted if its `RegistrationResult.fit` is below this share of the best of the
             last scans, as after a turn so wide that the registration ends at a false fit.
+        min_information_share: likewise of `RegistrationResult.information` in the weakest direction. After a lost scan
+            ground rings may fit on the wrong rings, but then they hardly constrain the motion across them.
         min_information: the weakest direction is degenerate below this `RegistrationResult.information`, or below
             `GaussNewton.min_information`. Normals of noisy points look like information: up to 0.013 in a corridor,
             with projective association and 3 cm of noise. A street has 0.04 and more, a motorway as little as 0.004.
@@ -34,6 +37,7 @@ class Judgement:
     min_overlap: float = 0.03
     min_inlier_share: float = 0.6
     min_fit_share: float = 0.7
+    min_information_share: float = 0.3
     min_information: float = 0.01
     max_deviation_m: float = 0.5
     max_deviation_deg: float = 8.0
@@ -46,6 +50,15 @@ class Judgement:
     def accepts(self, result: RegistrationResult) -> bool:
         """Whether enough of the scan fits the map."""
         return result.overlap.item() >= self.min_overlap and result.inlier_share.item() >= self.min_inlier_share
+
+    def has_dropped(self, result: RegistrationResult, last: Collection[RegistrationResult]) -> bool:
+        """Whether the scan fits, or constrains its position, much less than the best of the last ones."""
+        best_fit = max((other.fit.item() for other in last), default=0.0)
+        most_information = max((other.information[0].item() for other in last), default=0.0)
+        return (
+            result.fit.item() < self.min_fit_share * best_fit
+            or result.information[0].item() < self.min_information_share * most_information
+        )
 
     def is_plausible(self, deviation: MotionDifference) -> bool:
         """Whether a vehicle can change its motion by this much in one scan."""

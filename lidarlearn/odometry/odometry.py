@@ -18,6 +18,7 @@ from lidarlearn.odometry.initialization.base import Initialization
 from lidarlearn.odometry.judgement import Judgement
 from lidarlearn.odometry.sampling import SampledScan
 from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, are_shares_of_a_period, as_scan
+from lidarlearn.registration.result import RegistrationResult
 
 _CLOSE_GUESS_ERROR_M = 0.1  # `Guess.error_m` of a motion that was found among several, or of the last one
 
@@ -60,7 +61,7 @@ class Odometry(ScanByScan):
         self._doubted_motion: Tensor | None = None
         self._first_scan: _FirstScan | None = None  # of the map, until another scan is registered to it
         self._guess_errors_m: deque[float] = deque(maxlen=5)
-        self._fits: deque[float] = deque(maxlen=5)
+        self._accepted: deque[RegistrationResult] = deque(maxlen=5)
         self._frames = 0
         self._coasted = 0  # scans since the last one in the map
 
@@ -154,7 +155,7 @@ class Odometry(ScanByScan):
     def _is_doubtful(self, attempt: Attempt) -> bool:
         if attempt.is_implausible or not self._judgement.accepts(attempt.result):
             return True
-        if attempt.result.fit.item() < self._judgement.min_fit_share * max(self._fits, default=0.0):
+        if self._judgement.has_dropped(attempt.result, self._accepted):
             return True
         # Along a degenerate direction the guess remains.
         guessed = se3.motion_difference(self._last_motion, attempt.guess.T_previous_new)
@@ -187,7 +188,7 @@ class Odometry(ScanByScan):
 
     def _update(self, scan: SampledScan, guess: Guess, attempt: Attempt) -> None:
         """Move as registered, and add the scan to the map."""
-        self._fits.append(attempt.result.fit.item())
+        self._accepted.append(attempt.result)
         self._guess_errors_m.append(_guess_error_m(scan, guess.T_previous_new, attempt.T_previous_new))
         self._accept_motion(attempt)
         self._backend.local_map.update(scan.deskewed(self._last_motion, attempt.result.skew), self._T_world_lidar)

@@ -89,6 +89,17 @@ def test_a_dropped_scan_is_flagged_and_recovered_from(association):
 
 
 @kd_at_least
+def test_scans_that_are_lost_again_and_again_at_90_km_h_are_recovered_from(association):
+    """Constant velocity is 2.5 m off then, the distance of some ground rings, which fit."""
+    drive = street(frames=24, step=2.5)
+    kept = [i for i in range(24) if i % 3 != 2]
+    frames = run(build(f"cv+{association}_f2m"), [drive.scan(i).points for i in kept])
+    translations, _ = motion_errors(poses(frames), drive.T_world_lidar[kept])
+    assert translations.max() < 0.05
+    assert [frame.health.status for frame in frames[2:]] == ["recovered", "ok"] * 7
+
+
+@kd_at_least
 def test_a_turn_by_20_degrees_from_one_scan_to_the_next_is_flagged_and_recovered_from(association):
     T_straight_turned = se3.from_euler(torch.tensor([0, 0, 0, 0, 0, math.radians(20)], dtype=torch.float64))
     turned = se3.transform(se3.inverse(T_straight_turned), scans()[AT])

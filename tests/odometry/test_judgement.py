@@ -1,9 +1,31 @@
 import pytest
+import torch
 
+from lidarlearn.geometry import se3
 from lidarlearn.geometry.se3 import MotionDifference
 from lidarlearn.odometry.judgement import Judgement
+from lidarlearn.registration.result import RegistrationResult
 
 JUDGEMENT = Judgement(max_deviation_m=0.5, max_deviation_deg=8.0, min_gain=0.1)
+
+
+def registered(
+    overlap: float = 1.0, inlier_share: float = 1.0, fit: float = 1.0, information: float = 1.0
+) -> RegistrationResult:
+    """A registration of which only these are known."""
+    shares = (torch.tensor(share) for share in (overlap, inlier_share, fit))
+    nothing, of_each_axis = torch.zeros(6), torch.full((3,), information)
+    return RegistrationResult(
+        se3.identity(),
+        nothing,
+        1,
+        torch.tensor(True),
+        *shares,
+        torch.tensor(0.0),
+        torch.eye(6),
+        of_each_axis,
+        nothing[:3],
+    )
 
 
 def test_a_motion_follows_another_if_both_its_changes_are_small():
@@ -24,6 +46,14 @@ def test_a_motion_follows_another_if_both_its_changes_are_small():
 )
 def test_a_change_of_motion_must_agree_better_in_proportion_and_by_no_more_than_the_gain(deviation, price):
     assert JUDGEMENT.credibility(0.6, deviation) == pytest.approx(0.6 - price)
+
+
+@pytest.mark.parametrize(("fit", "information", "dropped"), [(0.6, 0.04, False), (0.3, 0.1, True), (0.6, 0.02, True)])
+def test_a_registration_has_dropped_if_it_says_much_less_than_the_best_of_the_last(fit, information, dropped):
+    judgement = Judgement(min_fit_share=0.7, min_information_share=0.3)
+    last = [registered(fit=0.5, information=0.1), registered(fit=0.6, information=0.01)]
+    result = registered(fit=fit, information=information)
+    assert judgement.has_dropped(result, last) == dropped and not judgement.has_dropped(result, [])
 
 
 @pytest.mark.parametrize("setting", ["max_deviation_m", "max_deviation_deg"])
