@@ -16,45 +16,8 @@ from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import grid_sample
 from lidarlearn.odometry.deskew import deskew
 
-_DENSE_MAP_VOXEL_M, _PAPER_QUERY_VOXEL_M = 0.4, 1.0
-_NARROWEST_SEARCH_M = 0.5
+_NEIGHBOURHOOD_M = 0.4
 _PADDING = Padding()
-_DENSE_RANGE_M = 35.0  # up to here neighbouring beams are no farther apart than a voxel
-
-
-def map_voxel_m(projection: SphericalProjection) -> float:
-    """Voxel edge for the map of a sensor [m]: the paper's 0.4 m for 64 beams, 0.8 m for 32, 1.2 m for 16.
-
-    With 32 beams on a grid of 0.4 m the swinging pitch of a Segway is not followed.
-
-    Args:
-        projection: the sensor's image, one row a beam.
-
-    Source: Dellenbach et al. 2021, IV-A, for the HDL-64.
-    """
-    beam_spacing = math.radians(projection.fov_up_deg - projection.fov_down_deg) / projection.height
-    return max(_DENSE_MAP_VOXEL_M, round(beam_spacing * _DENSE_RANGE_M, 1))
-
-
-def query_voxel_m(projection: SphericalProjection) -> float:
-    """Voxel edge for the points that the paper's settings register [m]: 1 m for 64 beams, as for the map with fewer.
-
-    Args:
-        projection: the sensor's image, one row a beam.
-    """
-    map_voxel = map_voxel_m(projection)
-    return _PAPER_QUERY_VOXEL_M if map_voxel == _DENSE_MAP_VOXEL_M else map_voxel
-
-
-def search_distance_m(projection: SphericalProjection) -> float:
-    """How far a map point of a surface may be [m]: a voxel's edge, 0.5 m at least.
-
-    Narrower than its voxels, the search of 32 beams finds a fifth of the points of a swinging Segway's scans.
-
-    Args:
-        projection: the sensor's image, one row a beam.
-    """
-    return max(_NARROWEST_SEARCH_M, map_voxel_m(projection))
 
 
 @dataclass(frozen=True)
@@ -107,7 +70,7 @@ class Sampling(ABC):
     @property
     def neighbourhood_m(self) -> float:
         """Edge of the voxels whose points, and those of the voxels around, span a surface [m]."""
-        return _DENSE_MAP_VOXEL_M
+        return _NEIGHBOURHOOD_M
 
     @abstractmethod
     def sample(self, points: Float[Tensor, "n 3"], times: Float[Tensor, "n"] | None = None) -> SampledScan:

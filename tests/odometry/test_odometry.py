@@ -12,8 +12,8 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.odometry import Backend, GridSampling, LocalMap, Odometry
+from lidarlearn.odometry.beam_spacing import map_voxel_m
 from lidarlearn.odometry.initialization import ConstantVelocity, Initialization, InitialMotion
-from lidarlearn.odometry.sampling import map_voxel_m
 from lidarlearn.odometry.scan_by_scan import InitializationAlone
 from lidarlearn.registration.association import KdTree
 from lidarlearn.registration.gauss_newton import GaussNewton

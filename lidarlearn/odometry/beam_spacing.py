@@ -1,0 +1,44 @@
+"""Sizes of voxels and of the search that follow from the spacing of a sensor's beams."""
+
+import math
+
+from lidarlearn.geometry.projection import SphericalProjection
+
+_DENSE_MAP_VOXEL_M, _DENSE_QUERY_VOXEL_M = 0.4, 1.0
+_MIN_SEARCH_DISTANCE_M = 0.5
+_DENSE_RANGE_M = 35.0  # up to here neighbouring beams are no farther apart than a voxel
+
+
+def map_voxel_m(projection: SphericalProjection) -> float:
+    """Voxel edge for the map of a sensor [m]: the paper's 0.4 m for 64 beams, 0.8 m for 32, 1.2 m for 16.
+
+    With 32 beams on a grid of 0.4 m the swinging pitch of a Segway is not followed.
+
+    Args:
+        projection: the sensor's image, one row a beam.
+
+    Source: Dellenbach et al. 2021, IV-A, for the HDL-64.
+    """
+    beam_spacing = math.radians(projection.fov_up_deg - projection.fov_down_deg) / projection.height
+    return max(_DENSE_MAP_VOXEL_M, round(beam_spacing * _DENSE_RANGE_M, 1))
+
+
+def query_voxel_m(projection: SphericalProjection) -> float:
+    """Voxel edge for the points that the paper's settings register [m]: 1 m for 64 beams; with fewer, that of the map.
+
+    Args:
+        projection: the sensor's image, one row a beam.
+    """
+    map_voxel = map_voxel_m(projection)
+    return _DENSE_QUERY_VOXEL_M if map_voxel == _DENSE_MAP_VOXEL_M else map_voxel
+
+
+def search_distance_m(projection: SphericalProjection) -> float:
+    """How far a map point of a surface may be [m]: a voxel's edge, 0.5 m at least.
+
+    Narrower than its voxels, the search of 32 beams finds a fifth of the points of a swinging Segway's scans.
+
+    Args:
+        projection: the sensor's image, one row a beam.
+    """
+    return max(_MIN_SEARCH_DISTANCE_M, map_voxel_m(projection))
