@@ -92,7 +92,6 @@ def normal_map(
     normal, (across, along, _) = _fit((xx - x * x, xy - x * y, xz - x * z, yy - y * y, yz - y * z, zz - z * z))
     spans_patch = (above + diagonal >= 2) & (beside + diagonal >= 2)
     defined = (count >= 5) & spans_patch & (along > 0) & (across <= max_roughness**2 * along)
-    defined &= (channels != 0).any(0)
     normals = torch.stack(normal)
     away = (normals * channels).sum(0) > 0
     normals = normals * torch.where(away, -1.0, 1.0).to(normals.dtype) * defined

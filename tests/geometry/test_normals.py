@@ -101,6 +101,30 @@ def test_two_rows_are_enough():
     assert normals[:, 40:42].any() and angles_deg(normals, torch.tensor([0, 0, 1.0])).max() < 0.1
 
 
+@pytest.mark.parametrize(
+    ("neighbours", "is_enough"),
+    [
+        ([(0, -1), (0, 1), (-1, 0), (1, 0)], True),
+        ([(-1, -1), (-1, 1), (0, 1)], False),  # three
+        ([(0, -2), (0, -1), (0, 1), (0, 2), (-1, 0)], False),  # one in another row
+        ([(-2, 0), (-1, 0), (1, 0), (2, 0), (0, -1)], False),  # or column
+    ],
+)
+def test_a_normal_needs_four_neighbours_in_other_rows_and_columns(neighbours, is_enough):
+    floor = on_plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 1.73)
+    vertices = torch.zeros_like(floor)
+    for row, column in ((0, 0), *neighbours):
+        vertices[:, 40 + row, 360 + column] = floor[:, 40 + row, 360 + column]
+    assert normal_map(vertices, window=(5, 5))[:, 40, 360].any() == is_enough
+
+
+def test_rough_patches_have_no_normals():
+    wall = on_plane(torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64), 9.0)
+    rough = wall * (1 + 0.04 * (-1.0) ** torch.arange(720))  # every second column is farther away
+    strict, generous = (activated(normal_map(rough, max_roughness=r)).sum() for r in (0.2, 10.0))
+    assert strict < 0.05 * generous
+
+
 def test_neighbours_are_found_across_the_seam():
     vertices = on_plane(torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), 8.0)  # a wall behind the sensor
     rolled = normal_map(vertices.roll(360, dims=2)).roll(-360, dims=2)

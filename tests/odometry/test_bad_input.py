@@ -154,6 +154,12 @@ def test_after_a_long_gap_a_new_map_is_begun_and_said_so(association):
     assert translations.max() < 0.05
 
 
+def test_only_scans_in_a_row_count_towards_a_new_map():
+    drive = [torch.zeros(0, 3) if i % 2 else points for i, points in enumerate(scans())]
+    frames = run(build("cv+kd_f2m", "pipeline.judgement.restart_after=3"), drive)
+    assert [frame.health.status for frame in frames] == ["ok", *["coasted", "ok"] * 6]
+
+
 @kd_at_least
 def test_points_with_stray_times_are_left_out(association):
     """In the end each pose is that of scans without these points."""

@@ -60,6 +60,18 @@ def test_elevation_images_without_features_fall_back_to_constant_velocity(urban,
     assert after.source == "cv"
 
 
+def test_matches_that_follow_no_motion_fall_back_to_constant_velocity():
+    """Those of unrelated images: matches there are between any two."""
+    elevation, generator = ElevationImage(min_inliers=60), torch.Generator().manual_seed(0)
+    side = torch.arange(0, 2, 0.2)
+    for _ in range(2):
+        corners = 160 * torch.rand(600, 1, 2, generator=generator) - 80
+        heights = 10 * torch.rand(600, 1, 1, generator=generator).expand(-1, 100, -1)
+        boxes = torch.cat([corners + torch.cartesian_prod(side, side), heights], dim=2)
+        guess = elevation.predict(boxes.flatten(0, 1), LAST)
+    assert guess.source == "cv" and torch.equal(guess.T_previous_new, LAST)
+
+
 def test_the_elevation_image_holds_the_greatest_height_above_the_sensor_in_each_cell():
     elevation = ElevationImage(size_px=10, pixel_m=1.0, max_height_m=10.0)
     points = torch.tensor([[0.5, 0.5, 2.0], [0.6, 0.4, 5.0], [-4.5, 3.5, 20.0], [2.5, 2.5, -1.0], [7.0, 0.0, 3.0]])
@@ -90,6 +102,14 @@ def test_posenet_is_shown_the_previous_scan_and_the_new_one(urban):
     for i in (1, 2):
         guess = initialization.predict(urban.scan(i).points, LAST)
         assert guess.T_previous_new[:2, 3].tolist() == [counts[i - 1], counts[i]]
+
+
+def test_posenet_falls_back_to_constant_velocity_where_its_network_is_lost(monkeypatch):
+    nowhere = torch.full((1, 4, 4), torch.nan, dtype=torch.float64)
+    monkeypatch.setattr(_Network, "relative_pose", lambda network, reference, target: nowhere)
+    initialization = PoseNetInitialization(_Network())
+    guesses = [initialization.predict(torch.randn(10, 3), LAST) for _ in range(2)]
+    assert guesses[1].source == "cv" and torch.equal(guesses[1].T_previous_new, LAST)
 
 
 @pytest.mark.parametrize("T_previous_new", [torch.eye(4), torch.full((4, 4), torch.nan, dtype=torch.float64)])

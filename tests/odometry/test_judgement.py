@@ -48,6 +48,13 @@ def test_a_change_of_motion_must_agree_better_in_proportion_and_by_no_more_than_
     assert JUDGEMENT.credibility(0.6, deviation) == pytest.approx(0.6 - price)
 
 
+@pytest.mark.parametrize(
+    ("overlap", "inlier_share", "accepted"), [(0.5, 0.9, True), (0.02, 0.9, False), (0.5, 0.5, False)]
+)
+def test_what_overlaps_the_map_and_lies_on_it_is_accepted(overlap, inlier_share, accepted):
+    assert Judgement().accepts(registered(overlap, inlier_share)) == accepted
+
+
 @pytest.mark.parametrize(("fit", "information", "dropped"), [(0.6, 0.04, False), (0.3, 0.1, True), (0.6, 0.02, True)])
 def test_a_registration_has_dropped_if_it_says_much_less_than_the_best_of_the_last(fit, information, dropped):
     judgement = Judgement(min_fit_share=0.7, min_information_share=0.3)

@@ -1,6 +1,7 @@
 """Whole odometries, as configured, on generated drives: accurate from the first frame on."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -74,6 +75,17 @@ def test_a_backend_forgets_another_drive():
         frames = run(Odometry(ConstantVelocity(), backend), scans()[:3])
         translations, _ = motion_errors(poses(frames), street().T_world_lidar[:3])
         assert translations.max() < 0.02 and torch.equal(poses(frames)[0], se3.identity())
+
+
+def test_a_record_says_by_how_much_a_scan_is_skewed():
+    class Skewed(Backend):
+        def register(self, *arguments):
+            skew = torch.tensor([0.03, 0.04, 0, 0, 0, math.radians(0.2)], dtype=torch.float64)
+            return replace(super().register(*arguments), skew=skew)
+
+    odometry = Odometry(ConstantVelocity(), Skewed(GridSampling(), LocalMap(KdTree())))
+    health = run(odometry, scans()[:2])[1].health
+    assert health.skew_m == pytest.approx(0.05) and health.skew_deg == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("name", ["cv+kd_f2m", "ei"])

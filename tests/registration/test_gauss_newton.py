@@ -1,5 +1,7 @@
 """Registration on generated scenes: how far off it may start, what it says when it cannot know."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -169,8 +171,14 @@ def test_the_result_describes_the_registration(residual):
     assert torch.linalg.eigvalsh(result.hessian).min() > 0
 
 
+ON_PLANE = 5 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
+
+
 class _Plane(Association):
-    """The endless plane z = 0: a neighbour for every point, straight below it."""
+    """The endless plane z = 0: a neighbour for every point, straight below it or beside the foot."""
+
+    def __init__(self, beside_m: float = 0.0) -> None:
+        self.beside_m = beside_m
 
     def insert(self, points, T_world_lidar, frames) -> None:
         raise AssertionError("nothing to insert")
@@ -185,15 +193,16 @@ class _Plane(Association):
 
     def search(self, points_world: Tensor, max_distance_m: float, last: Neighbours | None = None) -> Correspondences:
         feet = points_world * torch.tensor([1.0, 1.0, 0.0])
+        feet[::2, 0] += self.beside_m
+        feet[1::2, 0] -= self.beside_m
         up = torch.tensor([0.0, 0.0, 1.0]).expand_as(feet)
         return Correspondences(feet, up, points_world[:, 2].abs() <= max_distance_m)
 
 
 def test_the_optimum_of_a_plane_is_found_in_closed_form():
     """Height, roll and pitch follow the plane; x, y and yaw are nobody's business and stay."""
-    points = 5 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
     start = torch.tensor([4.0, -3.0, 0.3, 0.05, -0.04, 0.7], dtype=torch.float64)
-    result = GaussNewton(weight=NoWeight()).register(points, _Plane(), se3.from_euler(start), 3.0)
+    result = GaussNewton(weight=NoWeight()).register(ON_PLANE, _Plane(), se3.from_euler(start), 3.0)
     end = se3.to_euler(result.T_world_lidar)
     assert result.converged and result.rmse_m < 1e-4
     assert end[2:5].abs().max() < 1e-4
@@ -209,13 +218,41 @@ def test_settings_that_never_come_to_an_end_are_refused(setting):
         GaussNewton(**setting)
 
 
+def one_step(height_m: float = 0.0, pitch: float = 0.0, **settings) -> RegistrationResult:
+    """Towards the plane."""
+    start = se3.exp(torch.tensor([0, 0, height_m, 0, pitch, 0], dtype=torch.float64))
+    return GaussNewton(weight=NoWeight(), max_iterations=1, **settings).register(ON_PLANE, _Plane(), start, 3.0)
+
+
 def test_steps_are_limited():
-    points = 5 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
-    start = torch.tensor([0.0, 0, 2.5, 0, 0, 0], dtype=torch.float64)
-    one_step = GaussNewton(weight=NoWeight(), max_iterations=1, max_step_m=0.4)
-    result = one_step.register(points, _Plane(), se3.exp(start), 3.0)
+    result, turned = one_step(height_m=2.5, max_step_m=0.4), one_step(pitch=0.1, max_step_deg=2.0)
     assert result.T_world_lidar[2, 3].item() == pytest.approx(2.1, abs=1e-6)
     assert result.iterations == 1 and not result.converged
+    assert math.degrees(0.1) - se3.rotation_angle(turned.T_world_lidar).rad2deg().item() == pytest.approx(2.0, abs=1e-3)
+
+
+def test_a_registration_cut_short_describes_where_it_ended():
+    result = one_step(height_m=0.6)
+    assert not result.converged and result.T_world_lidar[2, 3].abs() < 1e-3
+    assert result.rmse_m < 1e-3 and result.inlier_share == 1 and result.fit > 0.99
+
+
+def test_a_result_is_that_of_the_closed_forms():
+    """Three quarters are off the plane, as far above it as below, so that the scan stays where it is."""
+    points = ON_PLANE[:400].repeat(2, 1)
+    points[:, 2] = torch.tensor([0.0, 0.1, 0.1, 0.3]).repeat(200) * torch.tensor([1.0, -1.0]).repeat_interleave(400)
+    gauss_newton = GaussNewton(weight=Huber(0.1), inlier_residual_m=0.2, fit_residual_m=0.05)
+    result = gauss_newton.register(points, _Plane(), se3.identity(), 0.5)
+    assert result.overlap == 1 and result.inlier_share == 0.75
+    assert result.fit.item() == pytest.approx(0.25 + 0.5 * math.exp(-4), abs=1e-4)
+    squares, weights = 0.5 * 0.1**2 + 0.25 * 0.3**2 / 3, 0.75 + 0.25 / 3  # Huber's at 0.3 m is a third
+    assert result.rmse_m.item() == pytest.approx(math.sqrt(squares / weights), abs=1e-4)
+
+
+def test_point_to_point_is_judged_by_the_distance_off_the_surface():
+    gauss_newton = GaussNewton(residual=PointToPoint(), weight=NoWeight(), max_iterations=3)
+    result = gauss_newton.register(ON_PLANE, _Plane(beside_m=0.3), se3.identity(), 0.5)
+    assert result.inlier_share == 1 and result.fit > 0.99
 
 
 @all_associations

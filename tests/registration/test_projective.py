@@ -7,7 +7,7 @@ from torch import Tensor
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.normals import normal_map
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.registration.association import Projective
+from lidarlearn.registration.association import Projective, point_buffer
 from tests.registration import maps
 
 SMALL = SphericalProjection(height=16, width=90, fov_up_deg=3.0, fov_down_deg=-24.0)
@@ -117,6 +117,18 @@ def test_an_image_lasts_until_the_sensor_is_elsewhere_or_tilted(scans, xi, begin
     ahead = torch.tensor([[10.0, 0.0, -1.0]])
     seen_from = T_world_lidar if begins else se3.identity()
     assert torch.equal(association.bins(se3.transform(seen_from, ahead)), SMALL.pixel_index(ahead))
+
+
+def test_an_image_lasts_though_its_points_move_in_memory(scans, monkeypatch):
+    queries, found = torch.cat([se3.transform(poses()[i], scans[i][::31]) for i in range(4)]), []
+    for capacity in (1 << 16, 1):
+        monkeypatch.setattr(point_buffer, "_INITIAL_CAPACITY", capacity)
+        association = Projective(SMALL, image_distance_m=100.0)
+        for i in range(4):
+            association.insert(scans[i], poses()[i], frames=2)
+            found.append(association.search(queries, 1.0))
+    for a, b in zip(found[:4], found[4:], strict=True):
+        assert a.mask.any() and torch.equal(a.mask, b.mask) and torch.equal(a.points[a.mask], b.points[b.mask])
 
 
 def test_out_of_view_is_not_associated(scans):

@@ -98,9 +98,11 @@ def test_generalized_icp_is_the_mahalanobis_distance():
         assert residuals[i].square().sum().item() == pytest.approx(expected.item(), rel=1e-9)
 
 
-def test_generalized_icp_of_parallel_planes_is_the_point_to_plane_distance():
+@pytest.mark.parametrize("share", [1.0, 0.0])
+def test_generalized_icp_of_parallel_planes_is_the_point_to_plane_distance(share: float):
+    """A point without a normal lies on the surface that it is matched with."""
     problem = correspondences()
-    problem["normals"] = problem["map_normals"] @ problem["T_world_lidar"][:3, :3]
+    problem["normals"] = share * problem["map_normals"] @ problem["T_world_lidar"][:3, :3]
     size = GeneralizedIcp(1e-6).linearize(**problem)[..., 6].norm(dim=-1)
     plane = PointToPlane().linearize(**problem)[..., 6][:, 0].abs()
     torch.testing.assert_close(size, plane, rtol=1e-3, atol=1e-3)
