@@ -8,7 +8,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from lidarlearn.commands.configs import config_directory
-from lidarlearn.commands.protocol import ground_truth_digest
+from lidarlearn.commands.evaluate import configured_method
+from lidarlearn.commands.protocol import ground_truth_digest, method_settings
 from lidarlearn.commands.train import build_module
 from lidarlearn.geometry import se3
 from tests.box_world import BoxSequence
@@ -63,6 +64,18 @@ def test_what_a_network_has_seen_is_told_by_the_names_that_its_data_set_made_of_
     call(f"hydra.run.dir={tmp_path / 'run'}", f"ckpt={checkpoint}", "methods=[posenet]", "data.test_sequences=['1']")
     assert protocol(tmp_path / "run")["checkpoint"]["trained_on"]["train_sequences"] == ["0", "1"]
     assert "*: the network was trained on this sequence" in (tmp_path / "run" / "results.md").read_text()
+
+
+def test_the_settings_of_a_method_are_all_that_its_result_depends_on():
+    """Of a network counts what its file holds, not where it lies."""
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        config = compose("evaluate", ["device=cpu", "+networks.other=a.ckpt"])
+    networks = {"other": {"sha256": "00ff"}}
+    parts = {"other": (), "other+kd_f2m": ("odometry", "pipeline")}
+    for name, others in parts.items():
+        settings = method_settings(config, configured_method(config, name), networks)
+        assert settings.keys() == {"deskew", "seed", "device", "initialization", "network", *others}
+        assert settings["network"] == "00ff" and "network" not in settings["initialization"]
 
 
 def test_what_a_drive_is_scored_against_is_told_by_what_matters_of_it():

@@ -1,5 +1,7 @@
 """With `ckpt=...`, `train.py` and `evaluate.py` take from the checkpoint what the command line leaves out."""
 
+import functools
+import operator
 import shutil
 import sys
 from pathlib import Path
@@ -12,7 +14,7 @@ from lightning.pytorch import Trainer
 from omegaconf import OmegaConf
 
 from lidarlearn.commands import evaluate, train
-from lidarlearn.commands.checkpoint_options import add_data
+from lidarlearn.commands.checkpoint_options import add_data, given_checkpoint
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.resume import add_settings
 from lidarlearn.errors import UserError
@@ -76,6 +78,16 @@ def test_a_training_goes_on_as_it_was_configured(checkpoint, tmp_path, monkeypat
     assert config.model.rotation_scale == 0.2
     assert (config.scheduler, config.schedulers.step.milestones) == ("step", [1])
     assert (config.trainer.max_epochs, config.trainer.limit_train_batches) == (2, 2)
+
+
+def test_a_run_is_called_by_the_data_of_its_checkpoint(checkpoint, tmp_path, monkeypatch):
+    """Not by the option through which they are chosen."""
+    names = []
+    for command, name in ((train, "train"), (evaluate, "evaluate")):
+        monkeypatch.setattr(command, name, lambda config, data_name: names.append(data_name) or checkpoint)
+        monkeypatch.setattr(sys, "argv", ["x.py", f"ckpt={checkpoint}", f"hydra.run.dir={tmp_path}/{name}"])
+        command.main()
+    assert names == ["folder", "folder"]
 
 
 def test_settings_of_the_module_are_kept_and_can_be_changed(checkpoint, tmp_path):
@@ -158,6 +170,10 @@ def test_options_of_the_user_are_found_too(checkpoint, tmp_path, program):
 def test_several_checkpoints_at_once_are_refused(tmp_path, program, remedy):
     with pytest.raises(UserError, match=remedy):
         composed(tmp_path / "o", Path("a.ckpt,b.ckpt"), program=program)
+
+
+def test_the_last_checkpoint_on_a_command_line_counts():
+    assert given_checkpoint(["x.py", "ckpt=a.ckpt", "seed=1", "++ckpt=b.ckpt"], "one at a time") == Path("b.ckpt")
 
 
 @pytest.mark.parametrize("arguments", [["ckpt=a.ckpt,b.ckpt"], ["ckpt=a.ckpt", "hydra/launcher=submitit_slurm"]])
@@ -245,16 +261,20 @@ def test_data_of_a_checkpoint_lie_where_they_do_on_this_machine(checkpoint, tmp_
     assert composed(tmp_path / "o", checkpoint, "data.root=/mine", program="evaluate").data.root == "/mine"
 
 
+RUN_FOLDER = "lidarlearn.commands.run_folder"
+FOREIGN = {"_target_": f"{RUN_FOLDER}.git_revision"}
+
+
 @pytest.mark.parametrize("command", [train, evaluate])
 @pytest.mark.parametrize(
-    ("part", "evil"),
+    ("part", "evil", "said"),
     [
-        ("data", {"_target_": "lidarlearn.commands.run_folder._git", "_args_": ["-c", "alias.x=!touch PWNED", "x"]}),
-        ("data_name", "../../somewhere"),
-        ("data_name", "${oc.env:HOME}"),
+        ("data", {"_target_": f"{RUN_FOLDER}._git", "_args_": ["-c", "alias.x=!touch PWNED", "x"]}, "_git"),
+        ("data_name", "../../somewhere", "no name of a data set"),
+        ("data_name", "${oc.env:HOME}", "no name of a data set"),
     ],
 )
-def test_a_checkpoint_from_elsewhere_runs_nothing(checkpoint, tmp_path, monkeypatch, capsys, command, part, evil):
+def test_a_checkpoint_from_elsewhere_runs_nothing(checkpoint, tmp_path, monkeypatch, capsys, command, part, evil, said):
     content = torch.load(checkpoint, weights_only=True)
     content["hyper_parameters"]["trained_on"][part] = evil
     torch.save(content, tmp_path / "evil.ckpt")
@@ -262,21 +282,25 @@ def test_a_checkpoint_from_elsewhere_runs_nothing(checkpoint, tmp_path, monkeypa
     monkeypatch.setattr(sys, "argv", ["x.py", f"ckpt={tmp_path}/evil.ckpt", f"hydra.run.dir={tmp_path}/evil"])
     with pytest.raises(SystemExit):
         command.main()
-    assert "change: " in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert said in error and "change: " in error
     assert not list(tmp_path.rglob("PWNED"))
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("keys", "value"),
     [
-        {"datamodule": {"augmentation": {"_target_": "lidarlearn.commands.run_folder.git_revision"}}},
-        {"trainer": {"precision": {"_target_": "lidarlearn.commands.run_folder.git_revision"}}},
-        {"seed": "${oc.env:HOME}"},
+        (("hyper_parameters", "trained_on", "settings"), {"datamodule": {"augmentation": FOREIGN}}),
+        (("hyper_parameters", "trained_on", "settings"), {"trainer": {"precision": FOREIGN}}),
+        (("hyper_parameters", "trained_on", "settings"), {"seed": "${oc.env:HOME}"}),
+        *((("hyper_parameters", part), FOREIGN) for part in ("model", "loss", "optimizer", "scheduler")),
+        (("module",), FOREIGN["_target_"]),
     ],
 )
-def test_settings_of_a_checkpoint_are_plain(checkpoint, tmp_path, settings):
+def test_parts_of_a_checkpoint_are_of_their_kind_and_its_settings_plain(checkpoint, tmp_path, keys, value):
     content = torch.load(checkpoint, weights_only=True)
-    content["hyper_parameters"]["trained_on"]["settings"] = settings
+    *places, key = keys
+    functools.reduce(operator.getitem, places, content)[key] = value
     torch.save(content, tmp_path / "evil.ckpt")
     with pytest.raises(UntrustedTargetError):
         composed(tmp_path / "o", tmp_path / "evil.ckpt")

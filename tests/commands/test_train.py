@@ -66,15 +66,25 @@ def test_the_command_that_is_printed_knows_where_the_data_are(tmp_path, monkeypa
     assert told == "lidarlearn-evaluate ckpt=a.ckpt data=folder 'data.root=/my scans' data.max_frames=9"
 
 
-def test_the_revision_is_not_that_of_a_project_with_lidarlearn_in_its_environment(tmp_path, monkeypatch):
+def test_the_revision_is_that_of_a_clone_and_not_of_a_project_with_lidarlearn_in_its_environment(tmp_path, monkeypatch):
+    def git(*arguments):
+        subprocess.run(
+            ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *arguments], check=True
+        )
+
     installed = tmp_path / ".venv" / "lidarlearn" / "commands"
     shutil.copytree(Path(run_folder.__file__).parent, installed)
-    identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
-    for command in (["init", "-q"], [*identity, "commit", "-q", "--allow-empty", "-m", "of the project"]):
-        subprocess.run(["git", "-C", str(tmp_path), *command], check=True)
     monkeypatch.setattr(run_folder, "_SOURCE", installed)
     monkeypatch.setattr(run_folder, "__file__", str(installed / "run_folder.py"))
+    git("init", "-q")
+    git("commit", "-q", "--allow-empty", "-m", "of the project")
     assert git_revision() == "unknown"
+    git("add", ".venv")
+    git("commit", "-q", "-m", "a clone after all")
+    commit = git_revision()
+    assert re.fullmatch(r"[0-9a-f]{40}", commit)
+    (installed / "run_folder.py").write_text("# changed")
+    assert git_revision() == f"{commit}-modified"
 
 
 @pytest.mark.parametrize(
