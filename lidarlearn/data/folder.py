@@ -21,7 +21,7 @@ from lidarlearn.data import layout
 from lidarlearn.data.cloud_files import SUFFIXES, as_scan, note_returns, read_cloud, require_point_times
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.ground_truth import describe_ground_truth, find_ground_truth, read_ground_truth
-from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import read_times
 from lidarlearn.data.scan_files import ScanFiles, full_path, holds_scans, is_folder, list_scans, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FolderSequence(Sequence):
+class FolderSequence(SequenceOnDisk):
     """The scans of one folder.
 
     Args:
@@ -48,35 +48,16 @@ class FolderSequence(Sequence):
         empty: scans that were read and had not a single return.
     """
 
-    name: str
-    scans: ScanFiles
-    T_world_lidar: Float[Tensor, "n 4 4"] | None
-    timestamps: Float[Tensor, "n"] | None
     shares_per_unit: float | None
     bin_columns: int
     max_intensity: float | None
-    beam_correction_deg: float
     empty: list[int] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.scans)
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with point times relative to the middle of the sweep where the file has any."""
         cloud = read_cloud(self.scans.path(index), self.bin_columns)
         note_returns(cloud, self.name, index, self.empty)
         return as_scan(cloud, self.beam_correction_deg, self.max_intensity, self.shares_per_unit)
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the files and of all settings."""
-        return self.scans.fingerprint(
-            "Folder",
-            shares_per_unit=self.shares_per_unit,
-            bin_columns=self.bin_columns,
-            max_intensity=self.max_intensity,
-            beam_correction_deg=self.beam_correction_deg,
-        )
 
 
 class Folder(DataSetOnDisk):

@@ -32,10 +32,10 @@ from torch import Tensor
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import as_transforms, start_at_identity
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders, warn_of_gaps
-from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.progress import tracked
 
@@ -46,7 +46,7 @@ _SMALLEST_BYTES = 1000  # of a file that holds a scan
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FordCampusSequence(Sequence):
+class FordCampusSequence(SequenceOnDisk):
     """A drive of Ford Campus.
 
     Args:
@@ -58,15 +58,7 @@ class FordCampusSequence(Sequence):
         beam_correction_deg: angle by which every beam is raised.
     """
 
-    name: str
-    scans: ScanFiles
-    T_world_lidar: Float[Tensor, "n 4 4"] | None
-    timestamps: Float[Tensor, "n"] | None
     min_range_m: float
-    beam_correction_deg: float
-
-    def __len__(self) -> int:
-        return len(self.scans)
 
     def scan(self, index: int) -> Scan:
         """Read one scan; no times, it is motion compensated, and no intensities, the files hold none."""
@@ -79,13 +71,6 @@ class FordCampusSequence(Sequence):
             raise DamagedFileError(path, "points that are not finite")
         points = points[points.norm(dim=1) >= self.min_range_m]
         return Scan(raise_beams(points, self.beam_correction_deg))
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the files, the beam correction and the minimum range."""
-        return self.scans.fingerprint(
-            "FordCampus", beam_correction_deg=self.beam_correction_deg, min_range_m=self.min_range_m
-        )
 
 
 class FordCampus(DataSetOnDisk):

@@ -15,7 +15,7 @@ from torch import Tensor
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import as_transforms, read_kitti_poses, read_lines, read_times, start_at_identity
 from lidarlearn.data.scan_files import (
     ScanFiles,
@@ -25,14 +25,14 @@ from lidarlearn.data.scan_files import (
     subfolders,
     warn_of_gaps,
 )
-from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
 
 _WITH_GROUND_TRUTH = tuple(f"{i:02d}" for i in range(11))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class KittiOdometrySequence(Sequence):
+class KittiOdometrySequence(SequenceOnDisk):
     """A drive of KITTI odometry.
 
     Args:
@@ -44,26 +44,13 @@ class KittiOdometrySequence(Sequence):
         beam_correction_deg: angle by which every beam is raised.
     """
 
-    name: str
-    scans: ScanFiles
-    T_world_lidar: Float[Tensor, "n 4 4"] | None
-    timestamps: Float[Tensor, "n"] | None
     T_reference_lidar: Float[Tensor, "4 4"]
-    beam_correction_deg: float
     reference_frame: str = "camera"
-
-    def __len__(self) -> int:
-        return len(self.scans)
 
     def scan(self, index: int) -> Scan:
         """Read one scan; no times, it is motion compensated."""
         rows = read_float32_rows(self.scans.path(index), columns=4)
         return Scan(raise_beams(rows[:, :3], self.beam_correction_deg), intensities=rows[:, 3].clamp(0, 1))
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the files and the beam correction."""
-        return self.scans.fingerprint("KittiOdometry", beam_correction_deg=self.beam_correction_deg)
 
 
 class KittiOdometry(DataSetOnDisk):

@@ -20,7 +20,7 @@ from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.kitti_raw import sweep_times
-from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.oxts import read_timestamps
 from lidarlearn.data.pose_files import (
     StampedPoses,
@@ -31,14 +31,14 @@ from lidarlearn.data.pose_files import (
     start_at_identity,
 )
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, read_float32_rows, subfolders
-from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
 
 _PREFIX, _SUFFIX = "2013_05_28_drive_", "_sync"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Kitti360Sequence(Sequence):
+class Kitti360Sequence(SequenceOnDisk):
     """A drive of KITTI-360.
 
     Args:
@@ -49,25 +49,11 @@ class Kitti360Sequence(Sequence):
         beam_correction_deg: angle by which every beam is raised.
     """
 
-    name: str
-    scans: ScanFiles
-    T_world_lidar: Float[Tensor, "n 4 4"] | None
-    timestamps: Float[Tensor, "n"] | None
-    beam_correction_deg: float
-
-    def __len__(self) -> int:
-        return len(self.scans)
-
     def scan(self, index: int) -> Scan:
         """Read one scan, with point times relative to the middle of the sweep."""
         rows = read_float32_rows(self.scans.path(index), columns=4)
         points = raise_beams(rows[:, :3], self.beam_correction_deg)
         return Scan(points, times=sweep_times(points), intensities=rows[:, 3].clamp(0, 1))
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the files and the beam correction."""
-        return self.scans.fingerprint("Kitti360", beam_correction_deg=self.beam_correction_deg)
 
 
 class Kitti360(DataSetOnDisk):

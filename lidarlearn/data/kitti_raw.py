@@ -22,7 +22,7 @@ from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.interpolation import covered, interpolate_poses
-from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.oxts import read_oxts_poses, read_rigid_transform, read_timestamps
 from lidarlearn.data.pose_files import start_at_identity
 from lidarlearn.data.scan_files import (
@@ -33,7 +33,7 @@ from lidarlearn.data.scan_files import (
     subfolders,
     warn_of_gaps,
 )
-from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
 
 
@@ -71,7 +71,7 @@ _SLACK_S = 0.1  # by which a scan may be before the first or after the last GPS/
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class KittiRawSequence(Sequence):
+class KittiRawSequence(SequenceOnDisk):
     """A drive of KITTI raw.
 
     Args:
@@ -82,25 +82,11 @@ class KittiRawSequence(Sequence):
         beam_correction_deg: angle by which every beam is raised.
     """
 
-    name: str
-    scans: ScanFiles
-    T_world_lidar: Float[Tensor, "n 4 4"] | None
-    timestamps: Float[Tensor, "n"] | None
-    beam_correction_deg: float
-
-    def __len__(self) -> int:
-        return len(self.scans)
-
     def scan(self, index: int) -> Scan:
         """Read one scan, with point times relative to the middle of the sweep."""
         rows = read_float32_rows(self.scans.path(index), columns=4)
         points = raise_beams(rows[:, :3], self.beam_correction_deg)
         return Scan(points, times=sweep_times(points), intensities=rows[:, 3].clamp(0, 1))
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the files and the beam correction."""
-        return self.scans.fingerprint("KittiRaw", beam_correction_deg=self.beam_correction_deg)
 
 
 class KittiRaw(DataSetOnDisk):

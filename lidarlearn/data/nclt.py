@@ -23,10 +23,10 @@ from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
-from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, start_at_identity
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, read_bytes, subfolders
-from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
 
 POINT = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
@@ -37,7 +37,7 @@ FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class NcltSequence(Sequence):
+class NcltSequence(SequenceOnDisk):
     """A drive of NCLT.
 
     Args:
@@ -49,15 +49,7 @@ class NcltSequence(Sequence):
         sensor_height_m: of the laser above the origin of the files' frame.
     """
 
-    name: str
-    scans: ScanFiles
-    T_world_lidar: Float[Tensor, "n 4 4"] | None
-    timestamps: Float[Tensor, "n"] | None
-    beam_correction_deg: float
     sensor_height_m: float
-
-    def __len__(self) -> int:
-        return len(self.scans)
 
     def scan(self, index: int) -> Scan:
         """Read one scan; no times, it is motion compensated."""
@@ -66,13 +58,6 @@ class NcltSequence(Sequence):
         points = xyz * torch.tensor([1.0, -1.0, -1.0]) - torch.tensor([0.0, 0.0, self.sensor_height_m])
         points = raise_beams(points, self.beam_correction_deg)
         return Scan(points, intensities=torch.from_numpy(data["intensity"].astype(np.float32)) / 255)
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the files, the beam correction and the height of the sensor."""
-        return self.scans.fingerprint(
-            "Nclt", beam_correction_deg=self.beam_correction_deg, sensor_height_m=self.sensor_height_m
-        )
 
 
 class Nclt(DataSetOnDisk):

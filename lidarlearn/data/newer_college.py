@@ -20,10 +20,10 @@ from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.cloud_files import note_returns, read_cloud
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
-from lidarlearn.data.on_disk import DataSetOnDisk
+from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, stamped_poses, start_at_identity
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders
-from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
 
 BEAMS, COLUMNS = 64, 1024
@@ -40,7 +40,7 @@ T_CAMERA_LIDAR = _left_camera_to_lidar()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class NewerCollegeSequence(Sequence):
+class NewerCollegeSequence(SequenceOnDisk):
     """A walk of Newer College.
 
     Args:
@@ -52,15 +52,7 @@ class NewerCollegeSequence(Sequence):
         empty: scans that were read and had not a single return.
     """
 
-    name: str
-    scans: ScanFiles
-    T_world_lidar: Float[Tensor, "n 4 4"] | None
-    timestamps: Float[Tensor, "n"] | None
-    beam_correction_deg: float
     empty: list[int] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.scans)
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with point times relative to the middle of the sweep; none where columns are missing."""
@@ -69,11 +61,6 @@ class NewerCollegeSequence(Sequence):
         whole = cloud.file_rows == BEAMS * COLUMNS
         times = (cloud.rows // BEAMS).float() / COLUMNS - 0.5 if whole else None
         return Scan(raise_beams(cloud.points, self.beam_correction_deg), times=times)
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the files and the beam correction."""
-        return self.scans.fingerprint("NewerCollege", beam_correction_deg=self.beam_correction_deg)
 
 
 class NewerCollege(DataSetOnDisk):

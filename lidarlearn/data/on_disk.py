@@ -1,12 +1,45 @@
 """What data sets that are downloaded or recorded have in common: a root with sequences below it, whole or in part."""
 
 from abc import abstractmethod
+from dataclasses import dataclass, fields
 from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
 
 from lidarlearn.data import layout
 from lidarlearn.data.errors import ROOT_REMEDY, DataSetNotFoundError
 from lidarlearn.data.scan_files import ScanFiles, examples
-from lidarlearn.data.sequence import DataSet, LayoutReport
+from lidarlearn.data.sequence import DataSet, LayoutReport, Sequence
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SequenceOnDisk(Sequence):
+    """A sequence whose scans are files; a reader adds its settings as fields, and `scan`.
+
+    Args:
+        name: as on the command line.
+        scans: its files.
+        T_world_lidar: ground truth; None without.
+        timestamps: of the scans [s]; None where unknown.
+        beam_correction_deg: angle by which every beam is raised.
+    """
+
+    name: str
+    scans: ScanFiles
+    T_world_lidar: Float[Tensor, "n 4 4"] | None
+    timestamps: Float[Tensor, "n"] | None
+    beam_correction_deg: float
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the reader, its settings (every field that is a plain value) and the files."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
+        settings = {n: v for n, v in values.items() if v is None or isinstance(v, (str, int, float))}
+        return self.scans.fingerprint(type(self).__name__, **settings)
 
 
 class DataSetOnDisk(DataSet):

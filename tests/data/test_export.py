@@ -246,7 +246,7 @@ def test_poses_without_scans_are_not_written_over_either(tmp_path, capsys):
     (tmp_path / "kitti" / "sequences").mkdir()
     to = ("to=kitti_00-08", f"to.root={tmp_path}/kitti", "to.train_sequences=['00','01']")
     assert run("data=folder", f"data.root={tmp_path}/scans", *to, "to.val_sequences=[]", "to.test_sequences=[]") == 1
-    assert f"{poses} is there already" in capsys.readouterr().out
+    assert f"{poses} is there already" in capsys.readouterr().err
     assert list(contents(tmp_path / "kitti")) == [poses]
 
 
@@ -283,7 +283,7 @@ def test_what_cannot_be_written_is_said_with_what_can(arguments, said, tmp_path,
     monkeypatch.chdir(tmp_path)
     write_folder(tmp_path / "scans")
     assert run("data=folder", f"data.root={tmp_path}/scans", *arguments) == 1
-    assert said in capsys.readouterr().out and not (tmp_path / "x").exists()
+    assert said in capsys.readouterr().err and not (tmp_path / "x").exists()
 
 
 def test_the_options_named_in_the_advice_are_options():
@@ -325,7 +325,7 @@ def test_nothing_is_written_where_one_of_the_drives_cannot_be(tmp_path, capsys):
     to = ("to=ford_campus", f"to.root={tmp_path}/ford", "to.train_sequences=[IJRR-Dataset-1,IJRR-Dataset-2]")
     source = ("data=folder", f"data.root={tmp_path}/scans", "data.val_sequences=[]", "data.test_sequences=[]")
     assert run(*source, *to) == 1
-    assert "b has no ground truth" in capsys.readouterr().out and not (tmp_path / "ford").exists()
+    assert "b has no ground truth" in capsys.readouterr().err and not (tmp_path / "ford").exists()
     (tmp_path / "scans" / "b" / "poses.txt").write_text(kitti_rows(curve(2)))
     assert run(*source, *to) == 0
 
