@@ -43,4 +43,4 @@ def test_exports(blocked, tmp_path, capsys):
     write_float32(tmp_path / "scans" / "0.bin", random_points(0))
     with pytest.raises(SystemExit) as exited:
         main(["export", "data=folder", f"data.root={tmp_path}/scans", "to=kitti_00-08", f"to.root={blocked}"])
-    assert exited.value.code == 1 and "to.root=" in capsys.readouterr().out
+    assert exited.value.code == 1 and "to.root=" in capsys.readouterr().err
