@@ -1,4 +1,4 @@
-"""Progress of what goes scan by scan and may take minutes: simulating, projecting, running an odometry, writing."""
+"""Progress of tasks that process scan by scan: simulating, projecting, running an odometry, writing."""
 
 import sys
 import time
@@ -16,13 +16,13 @@ _SECONDS_BETWEEN_LINES = 30.0
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show how far something is; the function it gives is called after each scan, from any thread.
+    """Show the progress of a task; call the function that it yields after each scan, from any thread.
 
-    On a terminal a bar that goes away at the end. Into a file or a pipe a line at once, and one now and then, so that
-    a log stays readable and nobody takes a long silence for the end.
+    A terminal shows a bar, which disappears at the end. A file or a pipe gets a line at the start and then one every
+    half minute, so that a log stays readable and a silent task is not taken for a finished one.
 
     Args:
-        what: is done, e.g. "projecting sequence 00".
+        what: name of the task, e.g. "projecting sequence 00".
         total: number of scans.
     """
     if sys.stdout.isatty():

@@ -1,4 +1,4 @@
-"""Side by side: `python -m lidarlearn.evaluation compare`, and the jobs of a multirun of `evaluate.py`."""
+"""Results side by side: `python -m lidarlearn.evaluation compare`, and the jobs of a multirun of `evaluate.py`."""
 
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,14 @@ from lidarlearn.evaluation.report import print_tables, write_results
 
 
 def compare(runs: list[Path], output: Path | None = None) -> None:
-    """Print the results of several runs side by side, and write them.
+    """Print the results of several runs side by side, and optionally write them.
 
     Args:
-        runs: folders of evaluations.
+        runs: run folders of evaluations.
         output: folder for `results.json` and `results.md`; None only prints.
 
     Raises:
-        UserError: a folder holds no results.
+        UserError: a folder has no results.
     """
     content, tables, closing = comparison(comparable_groups([read_run(run) for run in runs]))
     print_tables(tables)
@@ -35,7 +35,7 @@ class GatheredResults(Callback):
     """Keeps one table of all finished jobs in the folder of a multirun, and prints it at the end."""
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **_: Any) -> None:
-        """Write the table anew, whichever process the job ran in."""
+        """Update the table after each job, in whichever process it ran."""
         if config.hydra.mode != RunMode.MULTIRUN:
             return
         folder = Path(config.hydra.sweep.dir)
@@ -49,12 +49,12 @@ class GatheredResults(Callback):
         folder = Path(config.hydra.sweep.dir)
         runs = _finished(folder)
         if not runs:
-            return  # every job has said what failed
+            return  # every job has reported its error
         compare(runs)
         print(f"results: {folder / 'results.md'}")
 
 
 def _finished(folder: Path) -> list[Path]:
-    """Folders of jobs that left results, in the order of their numbers."""
+    """Folders of the jobs with results, in the order of their numbers."""
     found = [path.parent for path in folder.glob("*/results.json") if path.parent.name.isdigit()]
     return sorted(found, key=lambda path: int(path.name))

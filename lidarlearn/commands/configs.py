@@ -1,4 +1,4 @@
-"""Where the configuration lies."""
+"""The place of the configuration."""
 
 from pathlib import Path
 
@@ -6,6 +6,6 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def config_directory() -> Path:
-    """The folder of the yaml files: `configs` beside the package in a source tree, within it once installed."""
+    """The folder of the yaml files: `configs` beside the package in a source tree, inside it once installed."""
     beside = _PACKAGE.parent / "configs"
     return beside if (beside / "train.yaml").is_file() else _PACKAGE / "configs"

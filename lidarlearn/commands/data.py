@@ -32,11 +32,11 @@ _ROLES = ("train", "val", "test")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one of the commands; exits with 0 only where it succeeded.
+    """Run one of the commands and exit, with 0 only if it succeeded.
 
     Args:
-        arguments: the command and Hydra overrides of the group `data`, anywhere among them `--config-dir DIR`; None
-            takes those of the process.
+        arguments: the command, Hydra overrides of the group `data`, and optionally `--config-dir DIR` at any place;
+            None takes the arguments of the process.
     """
     config_folder, rest = _without_config_dir(sys.argv[1:] if arguments is None else arguments)
     command, *overrides = rest or [""]
@@ -53,15 +53,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def check(overrides: Sequence[str], console: Console, config_folder: str | None = None) -> bool:
-    """Describe the data set that the overrides select; whether it can be used as configured."""
+    """Describe the data set that the overrides select, and return whether it is usable as configured."""
     report = compose_data_set(overrides, config_folder).full_check()
     show(report, console)
     return report.usable
 
 
 def export_all(overrides: Sequence[str], console: Console, config_folder: str | None = None) -> bool:
-    """Write the sequences of one data set in the format of another, and say how to train on them."""
-    # imported late: the writers' libraries are of no use to a check
+    """Write the sequences of one data set in the format of another, and print the command that trains on them."""
+    # imported late: a check does not need the libraries of the writers
     from lidarlearn.data.export.formats import export, format_of, require_new
 
     suffix = next((o.removeprefix("suffix=") for o in overrides if o.startswith("suffix=")), None)
@@ -75,16 +75,16 @@ def export_all(overrides: Sequence[str], console: Console, config_folder: str | 
         require_new(target, name)
     source.prepare(theirs)
     drives = source.sequences(theirs)
-    for mine, drive in drives.items():  # all, before the first is written: half an export would be in its own way
+    for mine, drive in drives.items():  # all of them first: half an export would block the next attempt
         form.require(drive, target, theirs[mine])
     for mine, drive in drives.items():
         export(drive, target, theirs[mine], suffix)
         console.print(f"{mine} -> {theirs[mine]}: {len(drive)} scans", markup=False)
     if left_out := [name for name in source.names if name not in theirs]:
         console.print(f"left out, {target.title} has no more names for them: {', '.join(left_out)}", markup=False)
-    folder = [] if config_folder is None else ["--config-dir", config_folder]  # all overrides stand on one side
+    folder = [] if config_folder is None else ["--config-dir", config_folder]  # all overrides on one side of it
     words = ["python", "train.py", *folder, *of_target]
-    if not any("projection" in o.partition("=")[0] for o in of_target):  # scans keep the sensor that they are of
+    if not any("projection" in o.partition("=")[0] for o in of_target):  # of the sensor of the scans
         ours, default = asdict(source.projection), asdict(target.projection)
         words += [f"data.projection.{key}={ours[key]}" for key in ours if ours[key] != default[key]]
     for role in _ROLES:
@@ -95,11 +95,11 @@ def export_all(overrides: Sequence[str], console: Console, config_folder: str | 
 
 
 def matched_names(source: DataSet, target: DataSet) -> dict[str, str]:
-    """The name in the target of each sequence of the source, whatever it is used for.
+    """The name in the target for each sequence of the source.
 
-    The n-th training sequence takes the target's n-th name that is still free, and so on; validation and test choose
-    first, so that training takes none of theirs. A folder of scans has no names of its own: there they stay. A
-    sequence for which no name is left is left out.
+    The n-th training sequence gets the n-th free name among the training sequences of the target, likewise for
+    validation and test. Test and validation choose first, so that training takes none of their names. A folder of scans
+    has no fixed names and keeps those of the source. A sequence is left out if no name is free.
     """
     if target.title == "folder of scans":
         return {name: name for name in source.names}
@@ -116,8 +116,8 @@ def compose_data_set(overrides: Sequence[str], config_folder: str | None = None)
     """The data set that Hydra overrides such as `data=nclt data.root=...` describe.
 
     Args:
-        overrides: of the group `data`.
-        config_folder: of the user's own options, beside ours.
+        overrides: overrides of the group `data`.
+        config_folder: a folder with further options of the user.
 
     Raises:
         HydraException, OmegaConfBaseException: no such data set or setting.
@@ -131,13 +131,13 @@ def compose_data_set(overrides: Sequence[str], config_folder: str | None = None)
 
 
 def data_groups(config_folder: str | None = None) -> list[str]:
-    """Names that `data=` takes, those of the user's own options among them."""
+    """The options of `data=`, including those in a folder of the user."""
     folders = [config_directory()] if config_folder is None else [config_directory(), Path(config_folder)]
     return sorted({path.stem for folder in folders for path in (folder / "data").glob("*.yaml")})
 
 
 def show(report: LayoutReport, console: Console) -> None:
-    """Print the findings, one a line, and what follows from them."""
+    """Print the findings, one per line, and the conclusion."""
     width = max((len(finding.what) for finding in report.findings), default=0)
     for finding in report.findings:
         line = Text(f"{finding.level:<8}", style=_STYLES[finding.level])
@@ -146,12 +146,12 @@ def show(report: LayoutReport, console: Console) -> None:
         console.print(Text("usable as configured", style="bold green"))
     else:
         missing = sum(finding.level == "missing" for finding in report.findings)
-        remedy = report.remedy or "mend what is listed as missing"
+        remedy = report.remedy or "add what is listed as missing"
         console.print(Text(f"NOT usable as configured ({missing} missing). change: {remedy}", style="bold"))
 
 
 def _without_config_dir(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
-    """The folder of the user's own options, wherever it is named, and the other arguments."""
+    """The value of `--config-dir` at any place, and the other arguments."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config-dir", nargs="?", const="")
     flags, others = parser.parse_known_args(arguments)

@@ -1,4 +1,4 @@
-"""Where a run computes."""
+"""The device of a run."""
 
 import torch
 from omegaconf import DictConfig, open_dict
@@ -7,10 +7,10 @@ from lidarlearn.errors import UserError
 
 
 def resolve_device(config: DictConfig) -> None:
-    """Let `device=auto` become cuda or cpu; there is no other device on which float64 can be computed.
+    """Replace `device=auto` with cuda or cpu. Other devices cannot compute in float64.
 
     Raises:
-        UserError: there is no such device.
+        UserError: the device does not exist, or is not supported.
     """
     name = config.device
     if name == "auto":
@@ -18,6 +18,6 @@ def resolve_device(config: DictConfig) -> None:
     if name == "cuda" and not torch.cuda.is_available():
         raise UserError("device=cuda: torch finds no CUDA device\n  change: device=auto or device=cpu")
     if name not in ("cpu", "cuda"):
-        raise UserError(f"device={name}: there is no such device\n  change: device=auto, cpu or cuda")
+        raise UserError(f"device={name} is not supported\n  change: device=auto, cpu or cuda")
     with open_dict(config):
         config.device = name

@@ -1,4 +1,4 @@
-"""What the commands share: a Hydra application whose users read one error instead of a stack trace."""
+"""A Hydra application that prints errors of the user as one message instead of a stack trace."""
 
 import os
 import sys
@@ -25,13 +25,13 @@ _SETTINGS_AT_FAULT = (TypeError, ValueError, ImportError)
 def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[[], None] = lambda: None) -> None:
     """Compose the configuration from the command line and run the task with it, once or for every job of a multirun.
 
-    What the user can mend is printed as one message, and the process exits with 1: a `UserError`, a typo in a group or
-    a key, settings that do not fit together. Everything else keeps its stack trace, and so does everything when the
-    environment variable HYDRA_FULL_ERROR is 1.
+    An error that the user can fix is printed as one message, and the process exits with 1: a `UserError`, a typo in a
+    group or a key, settings that contradict each other. Any other error keeps its stack trace. With the environment
+    variable HYDRA_FULL_ERROR=1 every error does.
 
     Args:
-        task: takes the composed configuration.
-        config_name: of the primary config in `configs/`.
+        task: called with the composed configuration.
+        config_name: name of the primary config in `configs/`.
         prepare: called before the configuration is composed, e.g. to complete the command line.
     """
     if os.environ.get(_FULL_ERROR) == "1":
@@ -48,12 +48,12 @@ def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[
             hydra_config = HydraConfig.get()
             if message is None:
                 raise
-            if hydra_config.mode != RunMode.MULTIRUN:  # Hydra would announce the error before it hands it on
+            if hydra_config.mode != RunMode.MULTIRUN:  # Hydra would print the error before it raises it again
                 _exit(message)
-            # The other jobs go on; the message alone also finds its way out of another process.
+            # The other jobs go on; of an exception in another process only the message arrives.
             raise UserError(f"job {hydra_config.job.num}: {message}") from error
 
-    os.environ[_FULL_ERROR] = "1"  # Hydra hands its errors on instead of printing them in its own way
+    os.environ[_FULL_ERROR] = "1"  # Hydra raises its errors instead of printing them
     try:
         with readable_errors(config_name):
             prepare()
@@ -64,11 +64,11 @@ def run(task: Callable[[DictConfig], None], config_name: str, prepare: Callable[
 
 @contextmanager
 def readable_errors(config_name: str, arguments: Sequence[str] | None = None) -> Iterator[None]:
-    """Print an error that the user can mend as one message on stderr, and exit with 1; any other passes.
+    """Print an error that the user can fix as one message on stderr, and exit with 1; raise any other error again.
 
     Args:
         config_name: see `readable_message`.
-        arguments: likewise.
+        arguments: see `readable_message`.
     """
     try:
         yield
@@ -80,12 +80,12 @@ def readable_errors(config_name: str, arguments: Sequence[str] | None = None) ->
 
 
 def readable_message(error: Exception, config_name: str, arguments: Sequence[str] | None = None) -> str | None:
-    """What to tell the user, None where the error is a defect.
+    """The message of an error that the user can fix; None if the error is a defect.
 
     Args:
-        error: whatever came up.
-        config_name: of the primary config, about which errors of Hydra and OmegaConf are.
-        arguments: the command line, without the program's name; None takes that of the process.
+        error: any exception.
+        config_name: name of the primary config, to explain errors of Hydra and OmegaConf.
+        arguments: the command line without the name of the program; None takes that of the process.
     """
     cause = error.__cause__ if isinstance(error, InstantiationException) else error
     if isinstance(cause, UserError) or _is_misconfiguration(error):
@@ -104,7 +104,7 @@ def readable_message(error: Exception, config_name: str, arguments: Sequence[str
 
 
 def _is_misconfiguration(error: BaseException | None) -> bool:
-    """Whether Lightning says so; told by name, since importing it takes seconds that an evaluation can do without."""
+    """Whether it is Lightning's error; compared by name, because an evaluation need not wait for Lightning's import."""
     return any(base.__name__ == "MisconfigurationException" for base in type(error).__mro__)
 
 

@@ -1,4 +1,4 @@
-"""`python evaluate.py`: run odometries, or take the trajectories of other tools, and score them."""
+"""`python evaluate.py`: run odometries, or read the trajectories of other tools, and score them."""
 
 import sys
 import tempfile
@@ -45,11 +45,11 @@ def main() -> None:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was evaluated.
+    """The result of an evaluation.
 
     Args:
-        sequences: by name.
-        T_world_lidar: poses by method and sequence.
+        sequences: the sequences by name.
+        T_world_lidar: estimated poses by method and sequence.
         scores: one per method and sequence.
     """
 
@@ -59,16 +59,16 @@ class Evaluation:
 
 
 def evaluate(config: DictConfig, data_name: str) -> Evaluation:
-    """Run or read as configured, score, and write everything into the run folder.
+    """Run methods or read trajectories, score them, and write everything into the run folder.
 
-    What is finished when an error comes up is reported before the error goes on.
+    After an error the finished sequences are reported before the error is raised again.
 
     Args:
         config: composed from `configs/evaluate.yaml`.
-        data_name: the config's choice of data.
+        data_name: the chosen option of the group `data`.
 
     Raises:
-        UserError: the data, the checkpoint, a trajectory or a setting is not as it should be.
+        UserError: the data, the checkpoint, a trajectory or a setting is invalid.
     """
     _seed(config.seed)
     resolve_device(config)
@@ -112,7 +112,7 @@ def _own(
     sequences: Mapping[str, Sequence],
     run_folder: Path,
 ) -> Iterator[tuple[Score, Tensor]]:
-    """Run every method on every sequence, unless the run folder holds that run, and score what they export."""
+    """Run every method on every sequence and score the exported trajectories; finished ones are reused."""
     data = OmegaConf.to_container(config.data, resolve=True)
     for method in methods:
         own = method_settings(config, method, networks)
@@ -124,7 +124,7 @@ def _own(
             found = export.settings()
             if found != settings:
                 if found is not None:
-                    print(f"{what}: run anew, {differing_settings(found, settings)}", flush=True)
+                    print(f"{what}: run again, {differing_settings(found, settings)}", flush=True)
                 odometry = build_odometry(config, method)
                 with progress(what, len(sequence)) as advance:
                     run_odometry(odometry, sequence, export, config.data.deskew, advance, settings)
@@ -150,15 +150,15 @@ def _foreign(config: DictConfig, sequences: Mapping[str, Sequence]) -> Iterator[
 
 
 def configured_method(config: DictConfig, name: str) -> Method:
-    """The method of a name, of the parts that the configuration has; see `parse_method`."""
+    """Parse the name of a method with the parts of the configuration, see `parse_method`."""
     initializations = dict.fromkeys([*config.initialization, *config.networks])
     return parse_method(name, initializations, list(config.odometry), list(config.baseline))
 
 
 def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
-    """A fresh odometry for a method, from the groups `initialization`, `odometry` and `pipeline`, or `baseline`.
+    """A new odometry for a method, from the groups `initialization`, `odometry` and `pipeline`, or `baseline`.
 
-    A network is built from `initialization.posenet`, with the checkpoint that `networks` has under its name.
+    A network is built from `initialization.posenet` with the checkpoint of that name in `networks`.
     """
     if method.initialization in config.baseline:
         return instantiate(config.baseline[method.initialization])
@@ -179,24 +179,24 @@ def _evaluate_as_chosen(config: DictConfig) -> None:
 
 
 def _require_use_of_checkpoint(config: DictConfig) -> None:
-    """Raise a `UserError` where `ckpt=...` gives neither a network nor the data."""
+    """Raise a `UserError` if `ckpt=...` provides neither a network nor the data."""
     used = {config.networks.get(method.initialization) for method in _methods(config)}
     if config.ckpt is not None and config.ckpt not in used and HydraConfig.get().runtime.choices["data"] != OPTION:
         raise UserError(
-            f"ckpt={config.ckpt}: no method runs this network\n"
+            f"ckpt={config.ckpt}: no method uses this network\n"
             f"  change: networks.posenet={config.ckpt} where an experiment names another, or methods=[posenet,...], "
             "or leave ckpt out"
         )
 
 
 def _methods(config: DictConfig) -> list[Method]:
-    """The methods to run; none where trajectories are scored in their stead."""
+    """The methods to run; none if trajectories are scored instead."""
     names = config.methods
     if config.trajectories is not None:
         if names is not None:
             raise UserError(
                 f"trajectories={config.trajectories} are scored instead of running methods={names}\n"
-                "  change: methods=null, or run the methods without trajectories=... and see both with "
+                "  change: methods=null, or run the methods without trajectories=... and compare both with "
                 "python -m lidarlearn.evaluation compare RUN RUN"
             )
         return []
@@ -213,7 +213,7 @@ def _seed(seed: int) -> None:
 
 def _report(run_folder: Path, protocol: dict[str, Any], evaluation: Evaluation, layout: TableLayout | None) -> None:
     """Files, plots, TensorBoard and the printed tables."""
-    from torch.utils.tensorboard import SummaryWriter  # slow to import, and only needed at the end
+    from torch.utils.tensorboard import SummaryWriter  # slow to import, only needed at the end
 
     scores, poses = evaluation.scores, evaluation.T_world_lidar
     seen = seen_in_training(protocol, scores)

@@ -1,4 +1,4 @@
-"""`python -m lidarlearn.evaluation compare|map|convergence ...`: what is made of results, and basins of convergence."""
+"""`python -m lidarlearn.evaluation compare|map|convergence ...`: comparisons, maps and basins of convergence."""
 
 import argparse
 import json
@@ -24,10 +24,10 @@ from lidarlearn.progress import progress
 
 _USAGE = """usage:
   python -m lidarlearn.evaluation compare RUN RUN ... [--output DIR]
-      results of several run folders side by side; what was not measured under the same protocol is kept apart
+      results of several run folders side by side, one table for each protocol
   python -m lidarlearn.evaluation map RUN [--method NAME] [--sequence NAME] [--voxel 0.2] [--every 1]
                                           [--min-range 2.5] [--max-range 60] [data.root=DIR]
-      maps of a run's drives as point clouds (.ply) and pictures, and how sharp they are, into RUN/maps
+      maps of the drives of a run as point clouds (.ply) and pictures, and their sharpness, into RUN/maps
   python -m lidarlearn.evaluation convergence [data=...] [backends=[p_f2m,kd_f2m]] [KEY=VALUE ...]
       how far off an initial pose may be for a registration to succeed"""
 
@@ -54,7 +54,7 @@ def measure_convergence(config: DictConfig) -> None:
         config: composed from `configs/convergence.yaml`.
 
     Raises:
-        UserError: the data or a setting is not as it should be.
+        UserError: the data or a setting is invalid.
     """
     resolve_device(config)
     unknown = [name for name in config.backends if name not in config.odometry]
@@ -97,13 +97,13 @@ def _map(arguments: list[str]) -> None:
     usual = MapSettings()
     parser = argparse.ArgumentParser("python -m lidarlearn.evaluation map")
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of an evaluation")
-    parser.add_argument("--method", metavar="NAME", help="only this method, e.g. cv+kd_f2m; else all")
-    parser.add_argument("--sequence", metavar="NAME", help="only this sequence; else all")
-    parser.add_argument("--voxel", type=float, default=usual.voxel_size_m, metavar="M", help="a point a voxel [m]")
-    parser.add_argument("--every", type=int, default=usual.every, metavar="N", help="each n-th scan only")
-    parser.add_argument("--min-range", type=float, default=usual.min_range_m, metavar="M", help="of the points [m]")
-    parser.add_argument("--max-range", type=float, default=usual.max_range_m, metavar="M", help="of the points [m]")
-    parser.add_argument("overrides", nargs="*", metavar="data.KEY=VALUE", help="where the data is elsewhere: data.root")
+    parser.add_argument("--method", metavar="NAME", help="only this method, e.g. cv+kd_f2m; default: all")
+    parser.add_argument("--sequence", metavar="NAME", help="only this sequence; default: all")
+    parser.add_argument("--voxel", type=float, default=usual.voxel_size_m, metavar="M", help="voxel edge [m]")
+    parser.add_argument("--every", type=int, default=usual.every, metavar="N", help="only each n-th scan")
+    parser.add_argument("--min-range", type=float, default=usual.min_range_m, metavar="M", help="of used points [m]")
+    parser.add_argument("--max-range", type=float, default=usual.max_range_m, metavar="M", help="of used points [m]")
+    parser.add_argument("overrides", nargs="*", metavar="data.KEY=VALUE", help="if the data has moved: data.root=DIR")
     options = parser.parse_intermixed_args(arguments)
 
     with entry_point.readable_errors("evaluate", options.overrides):

@@ -1,4 +1,4 @@
-"""`python -m lidarlearn.evaluation map`: the maps of an evaluation, made of its trajectories and the scans."""
+"""`python -m lidarlearn.evaluation map`: maps from the trajectories of an evaluation and the scans."""
 
 import json
 from collections.abc import Sequence as Series
@@ -24,17 +24,17 @@ from lidarlearn.training.parts import require_trusted
 def make_maps(
     run: Path, method: str | None, sequence: str | None, settings: MapSettings, overrides: Series[str] = ()
 ) -> None:
-    """Write the map of each method and sequence of a run, a picture of each, and `maps.json`; print what they are like.
+    """Write a map and a picture for each method and sequence of a run, and `maps.json`; print a table of the maps.
 
     Args:
-        run: folder of an evaluation.
-        method: the only one to take; None takes all.
-        sequence: likewise.
-        settings: what goes into the maps.
-        overrides: `data.KEY=VALUE`, where the data set has moved since.
+        run: run folder of an evaluation.
+        method: name of the only method; None takes all.
+        sequence: name of the only sequence; None takes all.
+        settings: settings of the maps.
+        overrides: `data.KEY=VALUE`, if the data set has moved since.
 
     Raises:
-        UserError: the run does not have what is asked for, or its scans are gone or others.
+        UserError: the run has no such trajectory, or its scans are missing or have changed.
     """
     config = _config_of(run, overrides)
     exports = _chosen(run, method, sequence)
@@ -42,7 +42,7 @@ def make_maps(
     names = sorted({export.sequence for export in exports})
     data.prepare(names)
     sequences = data.sequences(names)
-    _kept(run / "maps" / "maps.json")  # a damaged file is told of before the work
+    _kept(run / "maps" / "maps.json")  # reports a damaged file before the work
     rows = []
     for export in exports:
         rows.append(_make_map(run, export, sequences[export.sequence], settings, config.data.deskew))
@@ -52,12 +52,12 @@ def make_maps(
 
 
 def _config_of(run: Path, overrides: Series[str]) -> DictConfig:
-    """The run's configuration, with the data set that it says or the overrides move."""
+    """The configuration of the run, with the overrides applied to its data set."""
     path = run / "config.yaml"
     if not path.is_file() or not (run / "trajectories").is_dir():
         raise UserError(
             f"{run.absolute()}: no config.yaml, or no trajectories\n"
-            "  change: name a run folder of evaluate.py that ran methods (not one of trajectories=DIR or -m)"
+            "  change: name a run folder of evaluate.py with methods (not one of trajectories=DIR or -m)"
         )
     config = OmegaConf.load(path)
     assert isinstance(config, DictConfig)
@@ -70,7 +70,7 @@ def _config_of(run: Path, overrides: Series[str]) -> DictConfig:
 
 
 def _chosen(run: Path, method: str | None, sequence: str | None) -> list[Export]:
-    """The trajectories of the run that are asked for, whole ones only."""
+    """The finished trajectories of the chosen method and sequence."""
     exports = [Export(path.parent, path.stem) for path in sorted((run / "trajectories").glob("*/*.txt"))]
     interrupted = [export for export in exports if export.sequence.endswith(".partial")]
     found = [export for export in exports if export not in interrupted and export.settings() is not None]
@@ -80,19 +80,19 @@ def _chosen(run: Path, method: str | None, sequence: str | None) -> list[Export]
         there += [f"{export.kitti.relative_to(run)} (interrupted)" for export in interrupted]
         raise UserError(
             f"{run.absolute()}: no finished trajectory of {method or 'any method'} on {sequence or 'any sequence'}; "
-            f"there is: {', '.join(there) or 'nothing'}\n"
+            f"found: {', '.join(there) or 'nothing'}\n"
             f"  change: --method, --sequence, or finish the run: evaluate.py hydra.run.dir={run}"
         )
     return chosen
 
 
 def _make_map(run: Path, export: Export, sequence: Sequence, settings: MapSettings, deskewed: bool) -> dict[str, Any]:
-    """Build and write one map; what `maps.json` says of it."""
+    """Build and write one map; return its entry in `maps.json`."""
     method = export.folder.name
     scans = (export.settings() or {}).get("scans")
     if scans not in (None, sequence.fingerprint):
         raise UserError(
-            f"{sequence.name}: these are not the scans of the run (files, or settings of the data, have changed)\n"
+            f"{sequence.name}: these are not the scans of the run (files or settings of the data have changed)\n"
             "  change: data.root=DIR, or run evaluate.py again"
         )
     T_world_lidar, _ = read_export(export, sequence)
@@ -121,7 +121,7 @@ def _make_map(run: Path, export: Export, sequence: Sequence, settings: MapSettin
 
 
 def _keep(path: Path, row: dict[str, Any]) -> None:
-    """Write what is known of a map beside the others that there are, in place of an earlier map of the same."""
+    """Add the entry of a map to `maps.json`, replacing an earlier one of the same method and sequence."""
     others = [old for old in _kept(path) if (old["method"], old["sequence"]) != (row["method"], row["sequence"])]
     draft = path.with_suffix(".tmp")
     draft.write_text(json.dumps({"maps": [*others, row]}, indent=2) + "\n", encoding="utf-8")
@@ -129,7 +129,7 @@ def _keep(path: Path, row: dict[str, Any]) -> None:
 
 
 def _kept(path: Path) -> list[dict[str, Any]]:
-    """What is known of earlier maps."""
+    """The entries of earlier maps."""
     if not path.is_file():
         return []
     try:

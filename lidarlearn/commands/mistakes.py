@@ -1,4 +1,4 @@
-"""What Hydra says about a mistaken command line, in words that help who typed it."""
+"""Explanations of Hydra's errors about a mistaken command line, with suggestions."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -16,25 +16,25 @@ from lidarlearn.commands.configs import config_directory
 from lidarlearn.errors import UserError
 
 _OTHER_PROGRAM = {"train": "evaluate.py", "evaluate": "train.py"}
-_LEAST_LIKENESS = 0.6  # of what is worth a question
+_LEAST_LIKENESS = 0.6  # of a name that is suggested
 
-_NO_OPTION = "Config group override must be"  # a ValueError, unlike all else that Hydra has to say
+_NO_OPTION = "Config group override must be"  # a ValueError, unlike Hydra's other errors
 
 
 def is_mistake(error: Exception) -> bool:
-    """Whether it is what Hydra says about a command line that it cannot make a configuration of."""
+    """Whether it is an error of Hydra about a command line from which no configuration can be composed."""
     return isinstance(error, HydraException | OmegaConfBaseException) or (
         isinstance(error, ValueError) and str(error).startswith(_NO_OPTION)
     )
 
 
 def explanation(error: Exception, program: str, arguments: Sequence[str]) -> str:
-    """What is wrong, and what may have been meant.
+    """What is wrong with a command line, and similar names that may have been meant.
 
     Args:
-        error: raised while the configuration was composed: `is_mistake`.
+        error: raised while the configuration was composed; `is_mistake` is true for it.
         program: name of the primary config.
-        arguments: the command line, without the program's name.
+        arguments: the command line without the name of the program.
     """
     text = str(error).partition("\nConfig search path:")[0]
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
@@ -53,13 +53,13 @@ def explanation(error: Exception, program: str, arguments: Sequence[str]) -> str
 
 
 def require_parts(config: DictConfig) -> None:
-    """Check that no part was replaced with the name of one: `registration.weight=huber` is not how to choose it.
+    """Check that no part was replaced by its name: `registration.weight=huber` does not choose an option.
 
     Args:
-        config: of the job that runs.
+        config: configuration of the running job.
 
     Raises:
-        UserError: a string stands where a config group puts a part.
+        UserError: a string is in the place of a part.
     """
     for choice in HydraConfig.get().runtime.choices:
         group, at, place = str(choice).partition("@")
@@ -70,7 +70,7 @@ def require_parts(config: DictConfig) -> None:
 
 
 def nearest(name: str, known: Iterable[str], at_most: int = 6) -> list[str]:
-    """The names most like another, by their spelling as a whole or by as many of their last components."""
+    """The names most similar to another, as a whole or in their last components."""
     likeness = {other: _likeness(name, other) for other in known if other != name}
     best = max(likeness.values(), default=0.0)
     return [other for other, value in likeness.items() if value == best >= _LEAST_LIKENESS][:at_most]
@@ -84,7 +84,7 @@ def _likeness(name: str, other: str) -> float:
 
 
 def _unknown_option(path: str, options: Sequence[str]) -> str:
-    """There is no such option of a group; the options beside it, and the most similar one of the whole group."""
+    """Message about an unknown option: the most similar one of the group, and the options in the same folder."""
     group, _, option = path.partition("/")
     folder = config_directory() / group
     ours = (path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
@@ -95,7 +95,7 @@ def _unknown_option(path: str, options: Sequence[str]) -> str:
 
 
 def _no_option(arguments: Sequence[str]) -> str | None:
-    """A group is given what is no name of an option, such as null; None where it is none of ours."""
+    """Message about a group whose value is no name of an option, such as null; None if the group is not ours."""
     for argument in arguments:
         if "=" in argument and not argument.startswith("-"):
             override = OverridesParser.create().parse_override(argument)
@@ -113,7 +113,7 @@ def _question(names: Sequence[str]) -> str:
 
 
 def _keys(program: str, mistaken: str, arguments: Sequence[str]) -> list[str]:
-    """Every key and group of a program's configuration with the rest of a command line, or with none of it."""
+    """Every key and group of a program's configuration, composed with the rest of the command line if possible."""
     rest = [a for a in arguments if "=" in a and not a.lstrip("+~").startswith((mistaken, "-"))]
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
         try:

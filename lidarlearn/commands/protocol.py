@@ -1,4 +1,4 @@
-"""What a result was made with: the settings behind each trajectory, and the protocol that its table carries."""
+"""The settings behind each trajectory, and the protocol that is stored with a table."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -16,14 +16,14 @@ from lidarlearn.errors import UserError
 from lidarlearn.evaluation.methods import Method
 from lidarlearn.training.checkpoints import load_checkpoint, sha256
 
-_STEPS_PER_M = 2**13  # 0.1 mm; a power of two, since decimals in files would often lie on the edge between two steps
+_STEPS_PER_M = 2**13  # 0.1 mm; a power of two, because decimals in files would often be halfway between two steps
 
 
 def describe_networks(config: DictConfig, methods: Iterable[Method]) -> dict[str, dict[str, Any]]:
-    """What to tell about the checkpoint of each network that methods use: its path, its hash, what it was trained on.
+    """Path, hash and training data of the checkpoint of each network that the methods use.
 
     Raises:
-        UserError: checkpoints are not given, or not there; all of them are named.
+        UserError: checkpoints are not given or do not exist; the message lists all of them.
         CheckpointError: a file is no checkpoint.
     """
     used = dict.fromkeys(m.initialization for m in methods if m.initialization in config.networks)
@@ -34,11 +34,11 @@ def describe_networks(config: DictConfig, methods: Iterable[Method]) -> dict[str
 
 
 def method_settings(config: DictConfig, method: Method, networks: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """All of the configuration that a method's result depends on, beside the scans.
+    """All settings that the result of a method depends on, besides the scans.
 
     Args:
         config: composed from `configs/evaluate.yaml`.
-        method: one of the methods.
+        method: the method.
         networks: see `describe_networks`.
     """
     settings: dict[str, Any] = {"deskew": config.data.deskew, "seed": config.seed, "device": config.device}
@@ -50,14 +50,14 @@ def method_settings(config: DictConfig, method: Method, networks: Mapping[str, M
         if method.backend is not None:
             parts |= {"odometry": config.odometry[method.backend], "pipeline": config.pipeline}
     settings |= {name: OmegaConf.to_container(part, resolve=True) for name, part in parts.items()}
-    if method.initialization in networks:  # what counts is what the file holds, not where it lies
+    if method.initialization in networks:  # the content of the file counts, not its path
         settings["initialization"].pop("network")
         settings["network"] = networks[method.initialization]["sha256"]
     return settings
 
 
 def differing_settings(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """What sets the settings of an earlier run apart, in a few words."""
+    """Which settings of an earlier run differ, in a few words."""
     names = [name for name in dict.fromkeys([*wanted, *found]) if found.get(name) != wanted.get(name)]
     return f"the run folder has it with other settings ({', '.join(names)})"
 
@@ -65,7 +65,7 @@ def differing_settings(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> s
 def evaluation_protocol(
     config: DictConfig, data_name: str, networks: Mapping[str, Mapping[str, Any]], sequences: Mapping[str, Sequence]
 ) -> dict[str, Any]:
-    """Everything that two results must have in common to be comparable, and what they were made with."""
+    """Everything that must agree for two results to be comparable, and the versions and settings behind them."""
     data = config.data
     frame = ", ".join(dict.fromkeys(sequence.reference_frame for sequence in sequences.values()))
     foreign = {"path": config.trajectories, "frame": config.trajectories_frame or frame}
@@ -90,9 +90,9 @@ def evaluation_protocol(
 
 
 def ground_truth_digest(sequence: Sequence) -> str | None:
-    """Changes whenever a sequence would be scored against other poses, None where there are none to score against.
+    """Hash of the ground truth of a sequence; None if there is none.
 
-    Machines differ in the last digits of what they compute from the same files: these do not count.
+    It ignores the last digits, in which machines differ that compute the poses from the same files.
     """
     if sequence.T_world_lidar is None:
         return None
@@ -105,7 +105,7 @@ def _is_file(path: str | None) -> bool:
 
 
 def _remedy(network: str, path: str | None) -> str:
-    """How to come by the checkpoint of a network."""
+    """Message about a missing checkpoint of a network, and how to get it."""
     seen = f"networks.{network}: a trained network is needed" if path is None else f"networks.{network}: no file {path}"
     setting = "ckpt" if network == "posenet" and path is None else f"networks.{network}"
     remedy = f"{seen}\n  change: {setting}=RUN/checkpoints/best.ckpt"
@@ -122,7 +122,7 @@ def _checkpoint(path: Path) -> dict[str, Any]:
         "sha256": sha256(path),
         "trained_on": {
             "data": trained_on["data_name"],
-            # of earlier versions, as they were set: null, or numbers
+            # earlier versions stored them as configured: null, or numbers
             "train_sequences": trained_on.get("train_sequences", trained_on["data"]["train_sequences"]),
             "loss": trained_on["loss"],
             "git": trained_on["git"],

@@ -1,4 +1,4 @@
-"""`python train.py ckpt=...`: a training goes on as it was configured, unless the command line says otherwise."""
+"""`python train.py ckpt=...`: a training resumes with its own settings, unless the command line changes them."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from lidarlearn.training.parts import require_plain, require_trusted
 
 _FIXED = {"model": nn.Module, "loss": nn.Module, "optimizer": Optimizer, "scheduler": LRScheduler}
 
-# What decides about the result, beside the parts and the data; processors, paths and displays are those of each run.
+# Settings that the result depends on, besides the parts and the data; devices, paths and displays may change.
 _OF_DATAMODULE = ("batch_size", "augmentation")
 _OF_TRAINER = (
     "max_epochs", "min_epochs", "max_steps", "min_steps", "precision", "accumulate_grad_batches", "gradient_clip_val",
@@ -34,7 +34,7 @@ _OF_TRAINER = (
 
 
 def settings_to_keep(config: DictConfig) -> dict[str, Any]:
-    """What a checkpoint has to tell for a training to go on alike, beside its parts and its data."""
+    """Settings that a checkpoint stores besides parts and data, so that a resumed training continues identically."""
 
     def plain(node: DictConfig, keys: tuple[str, ...]) -> dict[str, Any]:
         values = {key: node[key] for key in keys}
@@ -48,14 +48,14 @@ def settings_to_keep(config: DictConfig) -> dict[str, Any]:
 
 
 def add_settings(arguments: list[str], folder: Path) -> None:
-    """Let `ckpt=...` choose the data, the parts and the recipe of the training that it ended.
+    """Let `ckpt=...` choose the data, the parts and the recipe of its training.
 
     Args:
-        arguments: the command line; it is completed.
-        folder: an empty one for the options.
+        arguments: the command line, completed in place.
+        folder: an empty folder for the options.
     """
     path = given_checkpoint(arguments, "one at a time")
-    if path is None or RECIPE in arguments:  # the further processes of a training inherit all
+    if path is None or RECIPE in arguments:  # further processes of a training inherit the completed command line
         return
     chosen = ["model", "loss", "optimizer"]
     if not is_data_given(arguments):

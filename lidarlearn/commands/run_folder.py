@@ -1,4 +1,4 @@
-"""What every run leaves in its folder besides its results: the effective config and the revision of the code."""
+"""The run folder: its lock, and the configuration and code revision that every run writes beside its results."""
 
 import subprocess
 from collections.abc import Iterator
@@ -17,9 +17,9 @@ _SOURCE = Path(__file__).resolve().parent
 
 
 def git_revision() -> str:
-    """Commit of the code that runs, marked "-modified" where files differ from it; "unknown" outside of a clone."""
+    """Commit of the running code, with "-modified" if files differ from it; "unknown" outside of a clone."""
     try:
-        _git("ls-files", "--error-unmatch", __file__)  # a clone of this code, not one that it was installed within
+        _git("ls-files", "--error-unmatch", __file__)  # a clone of this code, not a repository around its installation
         commit = _git("rev-parse", "HEAD")
         return f"{commit}-modified" if _git("status", "--porcelain", "--untracked-files=no") else commit
     except (OSError, subprocess.CalledProcessError):
@@ -27,13 +27,13 @@ def git_revision() -> str:
 
 
 def code_digest(*settings: Any) -> str:
-    """Hash of the source behind a result: the same code gives the same results, committed or not.
+    """Hash of the source code behind a result: of the package, and of classes from elsewhere that the settings name.
 
     Args:
-        settings: plain values, of which each `_target_` that is not the package's counts beside the package.
+        settings: plain values; each `_target_` outside of the package is included in the hash.
 
     Raises:
-        UserError: a `_target_` is not there.
+        UserError: a `_target_` does not exist.
     """
     others = sorted(target for target in set(_targets(settings)) if target.partition(".")[0] != PACKAGE.name)
     try:
@@ -43,19 +43,19 @@ def code_digest(*settings: Any) -> str:
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
-    """The checkpoints of the training whose folder it is; none where it is another's."""
+    """The checkpoints in a run folder; none if it is not that of a training."""
     return sorted((folder / "checkpoints").glob("*.ckpt"))
 
 
 @contextmanager
 def held_run_folder(folder: Path) -> Iterator[Path]:
-    """Keep a run folder to this process while it writes results there.
+    """Lock a run folder while this process writes results there.
 
     Args:
-        folder: made where missing.
+        folder: the run folder, created if missing.
 
     Raises:
-        UserError: it is that of a training, which would lose what it says of itself, or another process holds it.
+        UserError: the folder is that of a training, or another process has locked it.
     """
     elsewhere = f"hydra.run.dir={folder / 'evaluation'}, or any other folder (hydra.sweep.dir or subdir with -m)"
     if checkpoints_in(folder):
@@ -76,7 +76,7 @@ def held_run_folder(folder: Path) -> Iterator[Path]:
 
 
 def write_run_description(folder: Path, config: DictConfig) -> None:
-    """Write `config.yaml`, every setting of the run with its value, and `git_revision.txt`."""
+    """Write `config.yaml` with all settings of the run, and `git_revision.txt`."""
     folder.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
     (folder / "git_revision.txt").write_text(git_revision() + "\n", encoding="utf-8")

@@ -38,17 +38,17 @@ def main() -> None:
 
 
 def train(config: DictConfig, data_name: str) -> Path:
-    """Train as configured, from the start or from where `ckpt` ended.
+    """Train as configured, from the start or from a checkpoint.
 
     Args:
         config: composed from `configs/train.yaml`.
-        data_name: the config's choice of data, for the checkpoint to tell.
+        data_name: the chosen option of the group `data`, stored in the checkpoint.
 
     Returns:
-        The best checkpoint by validation, or the last one where nothing was validated.
+        The best checkpoint by validation, or the last one without validation.
 
     Raises:
-        UserError: the data, the checkpoint or a setting is not as it should be.
+        UserError: the data, the checkpoint or a setting is invalid.
     """
     quiet()
     seed_everything(config.seed, workers=True, verbose=False)
@@ -56,7 +56,7 @@ def train(config: DictConfig, data_name: str) -> Path:
     _require_workable(config)
     run_folder = Path(config.run_dir)
     trainer: Trainer = instantiate(config.trainer)
-    if trainer.is_global_zero:  # the other processes may come when the first has begun
+    if trainer.is_global_zero:  # the other processes may start after the first has written there
         _require_free(run_folder, config.ckpt)
     datamodule: OdometryDataModule = instantiate(config.datamodule)
     module = build_module(config, datamodule, data_name)
@@ -74,25 +74,25 @@ def command_with(
     program: str,
     overrides: Sequence[str] = (),
     config_folder: str | None = None,
-    is_data_told: bool = True,
+    is_data_stored: bool = True,
 ) -> str:
-    """The command that evaluates a checkpoint or goes on from it, as it can be pasted into a shell.
+    """The command that evaluates or resumes a checkpoint, ready to be pasted into a shell.
 
     Args:
         checkpoint: the file.
         program: evaluate or train.
-        overrides: of its training; where the data lie is told anew, since a checkpoint does not say.
-        config_folder: of the user's own options, from which its data may come.
-        is_data_told: whether the checkpoint tells the rest of its data. What is read by a class from elsewhere, which a
-            file must not choose, is told anew.
+        overrides: overrides of its training. `data.root` is repeated, because a checkpoint does not store it.
+        config_folder: a folder with options of the user, which its data may need.
+        is_data_stored: whether the checkpoint can choose its data. If the class of the data set is not from a trusted
+            package, it must not, and all overrides of the data are repeated.
     """
     path = str(checkpoint.relative_to(Path.cwd()) if checkpoint.is_relative_to(Path.cwd()) else checkpoint)
     if not _PLAIN_CHARACTERS.issuperset(path):
         path = quoted(path)  # for Hydra; the shell's quotes come around it
     start = f"python {program}.py" if Path(f"{program}.py").is_file() else f"lidarlearn-{program}"
-    arguments = [] if config_folder is None else ["--config-dir", config_folder]  # behind it more can be added
-    told_anew = ("data.root=",) if is_data_told else ("data=", "data.", "projection@data.")
-    arguments += [f"ckpt={path}", *(override for override in overrides if override.startswith(told_anew))]
+    arguments = [] if config_folder is None else ["--config-dir", config_folder]  # first, so that more can be appended
+    repeated = ("data.root=",) if is_data_stored else ("data=", "data.", "projection@data.")
+    arguments += [f"ckpt={path}", *(override for override in overrides if override.startswith(repeated))]
     return f"{start} {shlex.join(arguments)}"
 
 
@@ -125,15 +125,15 @@ def _say_how_to_go_on(config: DictConfig) -> None:
 
 
 def _command_as_here(checkpoint: Path, program: str, config: DictConfig) -> str:
-    """The command for the data of this run, as this machine has them."""
+    """The command with the overrides of this run that its data needs."""
     hydra = HydraConfig.get()
     folder = next((place.path for place in hydra.runtime.config_sources if place.provider == "command-line"), None)
-    is_data_told = config.data["_target_"].startswith(TRUSTED_PACKAGES)
-    return command_with(checkpoint, program, hydra.overrides.task, folder, is_data_told)
+    is_data_stored = config.data["_target_"].startswith(TRUSTED_PACKAGES)
+    return command_with(checkpoint, program, hydra.overrides.task, folder, is_data_stored)
 
 
 def _require_workable(config: DictConfig) -> None:
-    """Raise a `UserError` where settings do not go together, before hours are spent on data."""
+    """Raise a `UserError` if settings contradict each other, before hours are spent on data."""
     trainer = config.trainer
     if config.scheduler not in config.schedulers:
         raise UserError(f"scheduler={config.scheduler}: choose one of {', '.join(config.schedulers)}")
@@ -152,7 +152,7 @@ def _require_workable(config: DictConfig) -> None:
     is_endless = trainer.max_epochs == -1 or (trainer.max_epochs is None and trainer.max_time is not None)
     if by_steps and is_endless and trainer.max_steps == -1:
         raise UserError(
-            f"scheduler={config.scheduler} goes by the length of the training, which has no end: "
+            f"scheduler={config.scheduler} depends on the length of the training, which has no end: "
             f"trainer.max_epochs={trainer.max_epochs or 'null'}\n"
             "  change: trainer.max_epochs, or scheduler=step or constant"
         )
@@ -171,26 +171,26 @@ def _require_workable(config: DictConfig) -> None:
 
 
 def _require_free(run_folder: Path, resumed: str | None) -> None:
-    """Raise a `UserError` where a run folder holds another training: curves and checkpoints would mix."""
+    """Raise a `UserError` if a run folder holds another training: curves and checkpoints would mix."""
     folder = run_folder / "checkpoints"
     if checkpoints_in(run_folder) and (resumed is None or Path(resumed).resolve().parent != folder.resolve()):
         raise UserError(
             f"{run_folder} holds the checkpoints of another training\n"
             f"  change: hydra.run.dir to another folder (hydra.sweep.dir or subdir with -m), or delete this one, "
-            f"or ckpt={folder / 'last.ckpt'} to go on with it"
+            f"or ckpt={folder / 'last.ckpt'} to resume it"
         )
 
 
 def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: str) -> PoseNetModule:
-    """The module to train, from plain dicts, so that its checkpoint needs no config.
+    """The module to train, built from plain dicts, so that its checkpoint needs no config.
 
     Args:
         config: composed from `configs/train.yaml`.
-        datamodule: of the same configuration.
-        data_name: choice of the group `data`.
+        datamodule: built from the same configuration.
+        data_name: the chosen option of the group `data`.
 
     Raises:
-        UserError: a part does not take its settings.
+        UserError: a part does not accept its settings.
     """
 
     def plain(node: str) -> dict[str, Any]:
@@ -200,7 +200,7 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
     trained_on = {
         "data": {key: value for key, value in plain("data").items() if key != "root"},
         "data_name": data_name,
-        "train_sequences": list(datamodule.data.train_sequences),  # as the data set calls them: a setting may be null
+        "train_sequences": list(datamodule.data.train_sequences),  # the data set's own names: the setting may be null
         "loss": config.loss["_target_"].rpartition(".")[2],
         "git": git_revision(),
         "lidarlearn": lidarlearn.__version__,

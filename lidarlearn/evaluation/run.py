@@ -1,4 +1,4 @@
-"""Run odometries over sequences and export what they say; scoring reads nothing but these files."""
+"""Run odometries over sequences and export their results; scoring reads only these files."""
 
 import json
 import statistics
@@ -27,7 +27,7 @@ from lidarlearn.odometry.scan_by_scan import ScanByScan
 
 @dataclass(frozen=True)
 class Export:
-    """The files that a method leaves for a sequence.
+    """The files that a method writes for a sequence.
 
     Args:
         folder: `trajectories/<method>`.
@@ -58,12 +58,12 @@ class Export:
         return self.folder / f"{self.sequence}.json"
 
     def remove(self) -> None:
-        """Remove the files that there are."""
+        """Remove the existing files."""
         for path in (self.summary, self.kitti, self.tum, self.health):
             path.unlink(missing_ok=True)
 
     def settings(self) -> dict[str, Any] | None:
-        """The settings with which a whole run was exported; None where there is none."""
+        """The settings of a finished run; None if there is none."""
         if not (self.summary.is_file() and self.kitti.is_file()):
             return None
         return json.loads(self.summary.read_text(encoding="utf-8")).get("settings")
@@ -79,16 +79,16 @@ def run_odometry(
 ) -> None:
     """Feed a sequence to an odometry and export trajectory, health records and speed.
 
-    Reading scans is not part of the speed. Where a scan cannot be read, or the run is interrupted, what came before is
-    exported, under names that end in `.partial`, before the error goes on. Files of an earlier run are removed first.
+    The speed does not include reading scans. Files of an earlier run are removed first. After a damaged scan or an
+    interrupt, the frames before are exported under names that end in `.partial`, and the error is raised again.
 
     Args:
-        odometry: a fresh one.
-        sequence: what it is fed with.
-        export: where the files go.
-        deskew: whether the odometry is told the points' times.
+        odometry: a new one.
+        sequence: the scans.
+        export: the files to write.
+        deskew: whether the odometry gets the times of the points.
         advance: called after each scan.
-        settings: all that the result depends on, kept with it; plain values, lists and mappings.
+        settings: everything that the result depends on, stored with it; plain values, lists and mappings.
     """
     partial = Export(export.folder, f"{export.sequence}.partial")
     export.remove()

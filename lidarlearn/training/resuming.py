@@ -31,7 +31,7 @@ def require_resumable(path: Path, module: PoseNetModule, trainer: Trainer) -> No
         if changed:
             raise UserError(
                 f"ckpt={path} does not go on with another {part}: {', '.join(changed)}\n"
-                f"  change: leave the settings of the {part} to the checkpoint, or train anew, without ckpt"
+                f"  change: leave the settings of the {part} to the checkpoint, or train from the start, without ckpt"
             )
     loop = checkpoint["loops"]["fit_loop"]
     epochs, batches = loop["epoch_progress"]["current"], loop["epoch_loop.batch_progress"]

@@ -51,7 +51,7 @@ def test_a_run_with_other_settings_is_not_taken_for_this_one(call, no_plots, tmp
     run = f"hydra.run.dir={tmp_path}"
     call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']")
     printed = call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']", "odometry.p_f2m.local_map.size=2")
-    assert "cv+p_f2m on 0: run anew, the run folder has it with other settings (odometry)" in printed
+    assert "cv+p_f2m on 0: run again, the run folder has it with other settings (odometry)" in printed
     settings = json.loads((tmp_path / "trajectories/cv+p_f2m/0.json").read_text())["settings"]
     assert settings["odometry"]["local_map"]["size"] == 2
 
@@ -68,7 +68,7 @@ def test_a_run_of_the_user_s_own_class_is_taken_up_until_its_file_is_edited(call
         source_digest.cache_clear()
         printed.append(call(f"hydra.run.dir={tmp_path}", *own))
     assert ["found in the run folder" in text for text in printed] == [False, True, False]
-    assert "mine on 0: run anew, the run folder has it with other settings (code)" in printed[2]
+    assert "mine on 0: run again, the run folder has it with other settings (code)" in printed[2]
 
 
 @pytest.mark.slow
@@ -123,7 +123,7 @@ def test_a_checkpoint_that_nothing_uses_is_refused(no_data, checkpoint, tmp_path
     error = refused(capsys, f"ckpt='{checkpoint}'", *chosen, f"hydra.run.dir={tmp_path}")
     assert f"change: networks.posenet={checkpoint}" in error
     error = refused(capsys, f"ckpt='{checkpoint}'", "data=folder", "methods=[cv+p_f2m]", f"hydra.run.dir={tmp_path}")
-    assert "no method runs this network" in error
+    assert "no method uses this network" in error
 
 
 TABLE = (

@@ -62,7 +62,7 @@ def test_the_command_that_is_printed_knows_where_the_data_are(tmp_path, monkeypa
         command_with(tmp_path / "a.ckpt", "evaluate", overrides)
         == "lidarlearn-evaluate ckpt=a.ckpt 'data.root=/my scans'"
     )
-    told = command_with(tmp_path / "a.ckpt", "evaluate", overrides, is_data_told=False)
+    told = command_with(tmp_path / "a.ckpt", "evaluate", overrides, is_data_stored=False)
     assert told == "lidarlearn-evaluate ckpt=a.ckpt data=folder 'data.root=/my scans' data.max_frames=9"
 
 
