@@ -270,8 +270,8 @@ FOREIGN = {"_target_": f"{RUN_FOLDER}.git_revision"}
     ("part", "evil", "said"),
     [
         ("data", {"_target_": f"{RUN_FOLDER}._git", "_args_": ["-c", "alias.x=!touch PWNED", "x"]}, "_git"),
-        ("data_name", "../../somewhere", "no name of a data set"),
-        ("data_name", "${oc.env:HOME}", "no name of a data set"),
+        ("data_name", "../../somewhere", "not a valid name of a data set"),
+        ("data_name", "${oc.env:HOME}", "not a valid name of a data set"),
     ],
 )
 def test_a_checkpoint_from_elsewhere_runs_nothing(checkpoint, tmp_path, monkeypatch, capsys, command, part, evil, said):
