@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -217,7 +218,12 @@ def test_a_killed_training_resumes_at_its_epoch(tmp_path):
 def test_an_interrupted_training_says_how_it_goes_on(tmp_path, how):
     shown = ("trainer.max_epochs=1000", "callbacks.progress.seconds_between_lines=0")
     process = subprocess.Popen(
-        command(tmp_path, *shown), env=environment(), cwd=tmp_path, stdout=subprocess.PIPE, text=True
+        command(tmp_path, *shown),
+        env=environment(),
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=partial(signal.signal, how, signal.SIG_DFL),  # shells let jobs in the background ignore SIGINT
     )
     assert process.stdout is not None
     next(line for line in process.stdout if re.match(r"epoch +2/1000 \[#+-", line))
