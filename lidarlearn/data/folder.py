@@ -1,9 +1,9 @@
 """A folder of scans from anywhere: .bin, .npy, .pcd or .ply in natural name order, ground truth where there is some.
 
 On disk: either every subfolder with scans in it is a sequence, or the folder itself is one; where both hold scans, the
-subfolders are, and the folder only by its name. Beside its scans a sequence
-may have `times.txt` (a time [s] per scan) and ground truth of the LiDAR's own poses, in KITTI's or TUM's format:
-`poses.txt`, `poses.tum`, `groundtruth.txt` with the scans, or `<sequence>.txt`, `<sequence>.tum` beside its folder.
+subfolders are, and the folder only by its name. Beside its scans a sequence may have `times.txt` (a time [s] per scan)
+and ground truth of the LiDAR's own poses, in KITTI's or TUM's format: `poses.txt`, `poses.tum`, `groundtruth.txt` with
+the scans, or `<sequence>.txt`, `<sequence>.tum` beside its folder.
 KITTI rows belong to the scans in order; TUM rows are interpolated at the scans' times, where scans before or after them
 are left out, or belong to the scans in order where these have no times. Poses relate to the middle of a sweep. The
 scans' times tell the scan period, too, of which the points' times take a share.
@@ -51,7 +51,7 @@ class FolderSequence(SequenceOnDisk):
     shares_per_unit: float | None
     bin_columns: int
     max_intensity: float | None
-    empty: list[int] = field(default_factory=list)
+    empty: list[int] = field(default_factory=list, init=False)
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with point times relative to the middle of the sweep where the file has any."""

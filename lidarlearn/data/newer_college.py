@@ -52,7 +52,7 @@ class NewerCollegeSequence(SequenceOnDisk):
         empty: scans that were read and had not a single return.
     """
 
-    empty: list[int] = field(default_factory=list)
+    empty: list[int] = field(default_factory=list, init=False)
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with point times relative to the middle of the sweep; none where columns are missing."""

@@ -12,10 +12,12 @@ from lidarlearn.data.errors import ROOT_REMEDY, DataSetNotFoundError
 from lidarlearn.data.scan_files import ScanFiles, examples
 from lidarlearn.data.sequence import DataSet, LayoutReport, Sequence
 
+_NO_SETTINGS = ("name", "scans", "T_world_lidar", "timestamps")
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SequenceOnDisk(Sequence):
-    """A sequence whose scans are files; a reader adds its settings as fields, and `scan`.
+    """A sequence whose scans are files; a reader adds its settings as fields with a readable `repr`, and `scan`.
 
     Args:
         name: as on the command line.
@@ -36,9 +38,9 @@ class SequenceOnDisk(Sequence):
 
     @property
     def fingerprint(self) -> str:
-        """Digest of the reader, its settings (every field that is a plain value) and the files."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
-        settings = {n: v for n, v in values.items() if v is None or isinstance(v, (str, int, float))}
+        """Digest of the reader, its settings and the files; poses and times are no part of a scan."""
+        given = {f.name: getattr(self, f.name) for f in fields(self) if f.init and f.name not in _NO_SETTINGS}
+        settings = {name: value for name, value in given.items() if not isinstance(value, Tensor)}
         return self.scans.fingerprint(type(self).__name__, **settings)
 
 
