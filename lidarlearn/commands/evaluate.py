@@ -22,14 +22,14 @@ from lidarlearn.commands.protocol import describe_networks, differing_settings, 
 from lidarlearn.commands.run_folder import code_digest, held_run_folder, write_run_description
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
-from lidarlearn.evaluation.layout import TableLayout
 from lidarlearn.evaluation.methods import Method, parse_method
 from lidarlearn.evaluation.plots import figures, write_plots
 from lidarlearn.evaluation.report import print_tables, report_tables, seen_in_training, write_report
 from lidarlearn.evaluation.run import Export, read_export, run_odometry
 from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.submission import is_kitti_test_set, write_submission
-from lidarlearn.evaluation.trajectories import find_trajectories, lidar_poses, read_trajectory
+from lidarlearn.evaluation.table_layout import TableLayout
+from lidarlearn.evaluation.trajectory_files import find_trajectories, lidar_poses, read_trajectory
 from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
 from lidarlearn.progress import progress
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from lidarlearn.errors import UserError
-from lidarlearn.evaluation.layout import TableLayout
 from lidarlearn.evaluation.report import report_tables, results_content, seen_in_training
 from lidarlearn.evaluation.run import Export
 from lidarlearn.evaluation.score import Score
+from lidarlearn.evaluation.table_layout import TableLayout
 from lidarlearn.evaluation.tables import Table
 from lidarlearn.metrics.kitti import SegmentAverage
 

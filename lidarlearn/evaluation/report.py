@@ -11,9 +11,9 @@ from typing import Any
 
 from rich.console import Console
 
-from lidarlearn.evaluation.layout import TableLayout
 from lidarlearn.evaluation.published import published_beside, whole_kitti_sequences
 from lidarlearn.evaluation.score import Averages, Score, average_scores
+from lidarlearn.evaluation.table_layout import TableLayout
 from lidarlearn.evaluation.tables import Table
 
 _UNDEFINED = "-"

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidarlearn.data.sequence import Sequence
 from lidarlearn.errors import UserError
-from lidarlearn.evaluation.trajectories import (
+from lidarlearn.evaluation.trajectory_files import (
     read_trajectory,
     to_lidar_frame,
     to_reference_frame,

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data.sequence import Sequence
-from lidarlearn.evaluation.trajectories import TrajectoryError, to_reference_frame
+from lidarlearn.evaluation.trajectory_files import TrajectoryError, to_reference_frame
 from lidarlearn.metrics import kitti
 from lidarlearn.metrics.absolute import ape_rmse
 from lidarlearn.metrics.failures import registration_failures

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarlearn.commands import evaluate
-from lidarlearn.evaluation.trajectories import write_kitti
+from lidarlearn.evaluation.trajectory_files import write_kitti
 from tests.box_world import BoxSequence
 from tests.commands.scans import FRAMES, SENSOR
 

@@ -127,7 +127,7 @@ def test_a_checkpoint_that_nothing_uses_is_refused(no_data, checkpoint, tmp_path
 
 
 TABLE = (
-    "table={_target_:lidarlearn.evaluation.layout.TableLayout,title:both,"
+    "table={_target_:lidarlearn.evaluation.table_layout.TableLayout,title:both,"
     "figure:relative_translation_error_percent,columns:{first:['0'],second:['1']}}"
 )
 

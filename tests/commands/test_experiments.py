@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from lidarlearn.commands import entry_point
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.evaluate import configured_method
-from lidarlearn.evaluation.layout import TableLayout
+from lidarlearn.evaluation.table_layout import TableLayout
 
 FOLDER = config_directory() / "experiment"
 

@@ -6,11 +6,11 @@ import pytest
 
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.compare import comparable_groups, comparison, read_run
-from lidarlearn.evaluation.layout import TableLayout
 from lidarlearn.evaluation.report import write_report, write_results
 from lidarlearn.evaluation.run import Export
 from lidarlearn.evaluation.score import score
-from lidarlearn.evaluation.trajectories import write_kitti
+from lidarlearn.evaluation.table_layout import TableLayout
+from lidarlearn.evaluation.trajectory_files import write_kitti
 
 PROTOCOL = {"data": "towns", "beam_correction_deg": 0.0, "deskew": False, "max_frames": None}
 

@@ -7,7 +7,7 @@ from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 
 from lidarlearn.evaluation.score import score
-from lidarlearn.evaluation.trajectories import read_trajectory, to_lidar_frame, write_kitti
+from lidarlearn.evaluation.trajectory_files import read_trajectory, to_lidar_frame, write_kitti
 from lidarlearn.geometry import se3
 
 

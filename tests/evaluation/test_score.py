@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lidarlearn.evaluation.score import Score, average_scores, pool_by_length, score
-from lidarlearn.evaluation.trajectories import TrajectoryError, to_reference_frame
+from lidarlearn.evaluation.trajectory_files import TrajectoryError, to_reference_frame
 from lidarlearn.geometry import se3
 from lidarlearn.metrics import kitti
 from lidarlearn.metrics.kitti import SegmentAverage

@@ -4,7 +4,7 @@ import zipfile
 
 from lidarlearn.evaluation.run import Export
 from lidarlearn.evaluation.submission import KITTI_TEST_FRAMES, is_kitti_test_set, write_submission
-from lidarlearn.evaluation.trajectories import write_kitti
+from lidarlearn.evaluation.trajectory_files import write_kitti
 from tests.evaluation.conftest import DriveWithoutScans
 
 

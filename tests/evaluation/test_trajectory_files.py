@@ -4,7 +4,7 @@ import torch
 from evo.tools import file_interface
 
 from lidarlearn.errors import UserError
-from lidarlearn.evaluation.trajectories import (
+from lidarlearn.evaluation.trajectory_files import (
     TrajectoryError,
     find_trajectories,
     lidar_poses,

@@ -2,8 +2,8 @@
 
 import pytest
 
-from lidarlearn.evaluation.layout import TableLayout
 from lidarlearn.evaluation.score import Score
+from lidarlearn.evaluation.table_layout import TableLayout
 
 COLUMNS = {"seen": ["a", "b"], "new": ["c"]}
 
