@@ -1,1 +1,1 @@
-"""Training PoseNet with Lightning: modules, validation as an odometry, checkpoints, what is shown meanwhile."""
+"""Training PoseNet with Lightning: modules, validation as an odometry, checkpoints, progress."""

@@ -1,4 +1,4 @@
-"""What TensorBoard shows besides curves: images of the input and trajectories of held-out drives."""
+"""What TensorBoard shows besides curves: images of the input, and trajectories of the validation sequences."""
 
 import numpy as np
 import torch
@@ -15,11 +15,11 @@ from lidarlearn.geometry.projection import activated
 from lidarlearn.losses.projective import ProjectiveLoss, reproject
 from lidarlearn.training.module import PoseNetModule
 
-_IMAGE_ROWS = 192  # images are enlarged to about so many rows: beams are few and pages are high
+_IMAGE_ROWS = 192  # to which images are enlarged, roughly: a scan has few rows
 
 
 class EventLogger(TensorBoardLogger):
-    """TensorBoard's events, directly in the run folder, where `config.yaml` tells all hyper-parameters.
+    """TensorBoard's events, directly in the run folder, whose `config.yaml` holds all hyperparameters.
 
     Args:
         save_dir: the folder.
@@ -29,23 +29,23 @@ class EventLogger(TensorBoardLogger):
         super().__init__(save_dir, name="", version="", default_hp_metric=False)
 
     def save(self) -> None:
-        """Write what is there, and no hparams.yaml, which would be empty."""
+        """Flush the events; write no hparams.yaml, which would be empty."""
         self.experiment.flush()
 
 
 class _Drawing(Callback):
-    """Draws what a validation shows, now and then.
+    """Draws the results of a validation every few epochs.
 
     Args:
-        every_n_epochs: so many epochs lie between two drawings, or more where fewer are validated.
+        every_n_epochs: least number of epochs between two drawings; more if validation runs less often.
     """
 
     def __init__(self, every_n_epochs: int) -> None:
         self.every_n_epochs = every_n_epochs
         self._last_epoch: int | None = None
 
-    def begin(self, trainer: Trainer) -> SummaryWriter | None:
-        """TensorBoard's writer where a drawing is due, in the one process that has it, outside of sanity checks."""
+    def writer_if_due(self, trainer: Trainer) -> SummaryWriter | None:
+        """TensorBoard's writer if a drawing is due; None otherwise, in sanity checks, and in all but one process."""
         writers = [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
         is_due = self._last_epoch is None or trainer.current_epoch - self._last_epoch >= self.every_n_epochs
         if not is_due or trainer.sanity_checking or not trainer.is_global_zero or not writers:
@@ -55,14 +55,14 @@ class _Drawing(Callback):
 
 
 class InputImages(_Drawing):
-    """Images of the first held-out pair: range and normals of its reference, and how well the target falls onto it.
+    """Images of the first validation pair: range and normals of the reference, and how well the target fits it.
 
-    Normals are those that the loss uses, where it uses any.
+    The normals are the loss's own if it uses any.
 
     Args:
-        every_n_epochs: how often to draw them, where a validation allows it.
-        max_range_m: range at the far end of the colour scale [m].
-        max_residual_m: point-to-plane distance at the far end of its colour scale [m].
+        every_n_epochs: least number of epochs between two drawings.
+        max_range_m: range at the end of the colour scale [m].
+        max_residual_m: point-to-plane distance at the end of its colour scale [m].
     """
 
     def __init__(self, every_n_epochs: int = 5, max_range_m: float = 60.0, max_residual_m: float = 1.0) -> None:
@@ -80,7 +80,7 @@ class InputImages(_Drawing):
         dataloader_idx: int = 0,
     ) -> None:
         """Draw the first pair of the first sequence."""
-        writer = None if batch_idx or dataloader_idx else self.begin(trainer)
+        writer = None if batch_idx or dataloader_idx else self.writer_if_due(trainer)
         if writer is None:
             return
         assert isinstance(pl_module, PoseNetModule)
@@ -102,18 +102,18 @@ class InputImages(_Drawing):
 
 
 class Trajectories(_Drawing):
-    """Each held-out drive as predicted, over its ground truth, as a figure.
+    """A figure of each validation sequence: the predicted trajectory over the ground truth.
 
     Args:
-        every_n_epochs: how often to draw them, where a validation allows it.
+        every_n_epochs: least number of epochs between two drawings.
     """
 
     def __init__(self, every_n_epochs: int = 1) -> None:
         super().__init__(every_n_epochs)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the drives of this validation, which the module has only just chained."""
-        writer = self.begin(trainer)
+        """Draw the trajectories that the module has just predicted."""
+        writer = self.writer_if_due(trainer)
         if writer is None:
             return
         assert isinstance(pl_module, PoseNetModule)
@@ -124,7 +124,7 @@ class Trajectories(_Drawing):
 
 
 def range_image(vertex_map: Float[Tensor, "3 h w"], max_range_m: float) -> Float[Tensor, "3 h w"]:
-    """Ranges in colour, square-root scaled so that near structure shows; black where no point fell."""
+    """Ranges in colour, on a square-root scale that shows near structure; black where no point fell."""
     ranges = vertex_map.norm(dim=0)
     return scalar_image(ranges.sqrt(), activated(vertex_map), max_range_m**0.5)
 
@@ -142,6 +142,6 @@ def scalar_image(values: Float[Tensor, "h w"], valid: Tensor, largest: float) ->
 
 
 def enlarged(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 i j"]:
-    """Every pixel repeated, a whole number of times."""
+    """The image with each pixel repeated a whole number of times."""
     times = max(1, _IMAGE_ROWS // image.shape[1])
     return image.repeat_interleave(times, dim=1).repeat_interleave(max(1, times // 2), dim=2)

@@ -1,4 +1,4 @@
-"""Checkpoint files: plain data that says what it was trained on, loaded without running anything of it."""
+"""Checkpoint files: plain data that record what they were trained on; loading one runs none of its code."""
 
 import hashlib
 import pickle
@@ -9,10 +9,10 @@ import torch
 
 from lidarlearn.errors import UserError
 
-# What each level of a checkpoint holds, among other things.
-_NEEDED = ("module", "hyper_parameters", "state_dict")
-_PARTS = ("model", "loss", "optimizer", "scheduler", "trained_on")
-_TOLD = ("data", "data_name", "loss", "git", "projection")
+# Keys that every checkpoint has: at the top, in its "hyper_parameters", and in their "trained_on".
+_KEYS = ("module", "hyper_parameters", "state_dict")
+_HYPER_PARAMETER_KEYS = ("model", "loss", "optimizer", "scheduler", "trained_on")
+_TRAINED_ON_KEYS = ("data", "data_name", "loss", "git", "projection")
 
 
 class CheckpointError(UserError):
@@ -20,7 +20,7 @@ class CheckpointError(UserError):
 
     Args:
         path: the file.
-        problem: what was seen.
+        problem: what is wrong with it.
     """
 
     def __init__(self, path: Path, problem: str) -> None:
@@ -31,30 +31,30 @@ class CheckpointError(UserError):
 
 
 def load_checkpoint(path: Path, map_location: torch.device | str = "cpu") -> dict[str, Any]:
-    """The content of a checkpoint of this project; never unpickles objects.
+    """Load a checkpoint of this project; never unpickles objects.
 
     Raises:
-        CheckpointError: the file is missing, damaged, holds more than plain data, or comes from elsewhere.
+        CheckpointError: the file is missing, damaged, holds more than plain data, or is not this project's.
     """
     if not path.is_file():
         raise CheckpointError(path, "no such file.")
     try:
         checkpoint = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
-        raise CheckpointError(path, "holds objects that only running its code could load, which is refused.") from error
+        raise CheckpointError(path, "holds objects that load only by running its code, which is refused.") from error
     except (RuntimeError, EOFError, OSError) as error:
         reason = next(iter(str(error).splitlines()), "it ends too early")
         raise CheckpointError(path, f"is damaged: {reason}") from error
     level = checkpoint
-    for key, needed in (("hyper_parameters", _NEEDED), ("trained_on", _PARTS), ("", _TOLD)):
-        if not isinstance(level, dict) or any(name not in level for name in needed):
+    for keys, below in ((_KEYS, "hyper_parameters"), (_HYPER_PARAMETER_KEYS, "trained_on"), (_TRAINED_ON_KEYS, "")):
+        if not isinstance(level, dict) or any(key not in level for key in keys):
             raise CheckpointError(path, "was not written by lidarlearn's training.")
-        level = level.get(key)
+        level = level.get(below)
     return checkpoint
 
 
 def sha256(path: Path) -> str:
-    """Hexadecimal digest of a file, by which a result names the checkpoint it was made with."""
+    """Hexadecimal digest of a file; results identify their checkpoint by it."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while chunk := file.read(1 << 20):

@@ -1,4 +1,4 @@
-"""Validation: the network as an odometry over held-out drives."""
+"""Validation: the network as an odometry over the validation sequences."""
 
 from dataclasses import dataclass
 
@@ -14,13 +14,13 @@ from lidarlearn.metrics.relative import relative_errors, relative_translation_er
 
 @dataclass(frozen=True)
 class PredictedDrive:
-    """A held-out drive as the network sees it, up to the last scan that was predicted without a gap.
+    """The trajectory of a validation sequence as predicted, up to the first scan without a prediction.
 
     Args:
-        name: the sequence's.
-        T_world_lidar: accumulated predictions, the first pose the identity, float64.
-        T_world_lidar_true: ground truth of the same scans; None without.
-        T_reference_lidar: to the frame in which the data set defines its metric.
+        name: of the sequence.
+        T_world_lidar: accumulated predictions, float64; the first pose is the identity.
+        T_world_lidar_true: ground truth of the same scans; None if there is none.
+        T_reference_lidar: from the LiDAR to the frame in which the data set defines its metric.
     """
 
     name: str
@@ -34,10 +34,10 @@ class DriveErrors:
     """Errors of a predicted drive.
 
     Args:
-        avg_translation_error_percent: KITTI's metric; None on a drive under 100 m.
+        avg_translation_error_percent: KITTI's metric; None for a drive under 100 m.
         mean_relative_translation_error_m: mean error of the translation between consecutive scans.
         mean_relative_translation_error_percent: the same as a share of the mean motion; None without motion.
-        mean_relative_rotation_error_deg: mean angle of the error of the rotation between consecutive scans.
+        mean_relative_rotation_error_deg: mean error angle of the rotation between consecutive scans.
     """
 
     avg_translation_error_percent: float | None
@@ -47,11 +47,11 @@ class DriveErrors:
 
 
 def predicted_drive(sequence: Sequence, indices: Tensor, parameters: Float[Tensor, "m 6"]) -> PredictedDrive:
-    """Chain predictions in the order of the scans.
+    """Accumulate predictions in the order of the scans.
 
     Args:
         sequence: the drive.
-        indices: of each prediction's reference scan, in any order, repeated ones allowed.
+        indices: of the reference scan of each prediction, in any order; may repeat.
         parameters: translation [m] and Euler angles [rad] of each `T_ref_new`.
     """
     indices, order = indices.cpu().sort(stable=True)
@@ -66,7 +66,7 @@ def predicted_drive(sequence: Sequence, indices: Tensor, parameters: Float[Tenso
 
 
 def drive_errors(drive: PredictedDrive) -> DriveErrors | None:
-    """Errors against ground truth; None without, or without a single pair."""
+    """Errors against ground truth; None without ground truth or with fewer than two poses."""
     if drive.T_world_lidar_true is None or len(drive.T_world_lidar) < 2:
         return None
     relative = relative_errors(drive.T_world_lidar, drive.T_world_lidar_true)
@@ -84,7 +84,7 @@ def drive_errors(drive: PredictedDrive) -> DriveErrors | None:
 
 
 def mean_errors(errors: list[DriveErrors]) -> dict[str, float]:
-    """Mean of each error over the drives that have it, by name; no entry where none has."""
+    """Mean of each error over the drives for which it is defined, by name; errors defined for none are left out."""
     means: dict[str, float] = {}
     for name in DriveErrors.__dataclass_fields__:
         values = [value for value in (getattr(e, name) for e in errors) if value is not None]

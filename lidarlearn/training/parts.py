@@ -1,4 +1,4 @@
-"""Parts of a training (model, loss, optimizer, scheduler) built from plain dicts, which a checkpoint can hold."""
+"""Building the parts of a training (model, loss, optimizer, scheduler) from the plain dicts of a checkpoint."""
 
 import importlib
 import inspect
@@ -12,34 +12,34 @@ from lidarlearn.simulation.sensors import Sensor
 
 TRUSTED_PACKAGES = ("lidarlearn.", "torch.optim.")
 
-# What may stand within a part, by its key: of each kind alone is it known that making one does nothing else.
-_PARTS_WITHIN = {"projection": SphericalProjection, "sensor": Sensor, "augmentation": Augmentation}
+# What may be built within a part, by key: only classes whose constructors are known to have no side effects.
+_NESTED_PARTS = {"projection": SphericalProjection, "sensor": Sensor, "augmentation": Augmentation}
 
 
 class UntrustedTargetError(UserError):
-    """A dict asks for more than one of this project's, or of torch's, parts with plain values."""
+    """A dict describes something other than a part of this project or of torch with plain values."""
 
     def __init__(self, what: str, why: str) -> None:
         super().__init__(
-            f"{what} is refused: {why}; a checkpoint could run any code otherwise\n"
-            "  change: use a checkpoint written by lidarlearn's training; a class of your own belongs into lidarlearn/,"
-            " but one that reads data may also be chosen by data=NAME"
+            f"{what} is refused: {why}; otherwise a checkpoint could run arbitrary code\n"
+            "  change: use a checkpoint written by lidarlearn's training; a class of your own has to be in lidarlearn/,"
+            " except a data set, which data=NAME can select instead"
         )
 
 
 def build(node: Mapping[str, Any], kind: type, **arguments: Any) -> Any:
     """An instance of the class that `_target_` names, with the dict's other keys as arguments.
 
-    The dict may come out of a checkpoint from anywhere: see `require_trusted`.
+    The dict may come from an untrusted checkpoint, see `require_trusted`.
 
     Args:
         node: `_target_` and the constructor's arguments, plain values.
-        kind: what it is to be.
+        kind: the class that the instance must have.
         arguments: further arguments that only exist at run time, such as an optimizer's parameters.
 
     Raises:
-        UntrustedTargetError: `_target_` is missing or names something else.
-        UserError: the constructor does not take, or refuses, the arguments.
+        UntrustedTargetError: `_target_` is missing or names anything else.
+        UserError: the constructor does not accept the arguments.
     """
     name = node.get("_target_")
     target = _trusted(name, kind)
@@ -50,20 +50,20 @@ def build(node: Mapping[str, Any], kind: type, **arguments: Any) -> Any:
         raise UserError(f"{name}: {error}\n  change: its keys are {_keys(target)}") from error
     try:
         return target(**merged)
-    except (TypeError, ValueError) as error:  # a value that the constructor refuses
+    except (TypeError, ValueError) as error:  # the constructor rejects a value
         given = {key: value for key, value in merged.items() if key not in arguments}
         raise UserError(f"{name}: {error}\n  it was given {given}") from error
 
 
 def argument(node: Mapping[str, Any], key: str) -> Any:
-    """The value of a part's setting: the constructor's default where the dict, such as an older one, does not have it.
+    """The value of a constructor's argument: as in the dict or, if an older dict lacks it, its default.
 
     Args:
         node: see `build`.
-        key: of the setting.
+        key: name of the argument.
 
     Returns:
-        None where the constructor takes no such argument, or has no default for it.
+        None if the constructor has no such argument, or no default for it.
     """
     if key in node:
         return node[key]
@@ -72,47 +72,50 @@ def argument(node: Mapping[str, Any], key: str) -> Any:
 
 
 def require_trusted(node: Mapping[str, Any], kind: type) -> None:
-    """Check that a config out of a checkpoint describes a thing of that kind, and can do nothing but describe it.
+    """Check that a config from a checkpoint describes an instance of a class and can do nothing else.
 
-    Whatever Hydra builds from it then is a class of `TRUSTED_PACKAGES` and of the kind that belongs in its place, given
-    plain values: no other callable, no arguments under Hydra's own keys, no interpolation.
+    Hydra can then build from it only classes of `TRUSTED_PACKAGES`, each of the kind that belongs in its place and
+    with plain values as arguments: no other callable, none of Hydra's own keys, no interpolation.
 
     Args:
         node: `_target_` and the constructor's arguments.
-        kind: what it is to be.
+        kind: the class that it must describe.
 
     Raises:
-        UntrustedTargetError: it is something else.
+        UntrustedTargetError: it is anything else.
     """
     _trusted(node.get("_target_"), kind)
     require_plain({key: value for key, value in node.items() if key != "_target_"})
 
 
 def require_plain(value: object, key: str = "") -> None:
-    """Check that a value out of a checkpoint is plain data, or a part of the kind that belongs under its key.
+    """Check that a value from a checkpoint is plain data, or a part of the kind that belongs under its key.
 
     Raises:
-        UntrustedTargetError: it is not.
+        UntrustedTargetError: it is anything else.
     """
     if isinstance(value, Mapping):
         if "_target_" in value:
-            if key not in _PARTS_WITHIN:
-                raise UntrustedTargetError(f"{key}._target_", "there is nothing to build in this place")
-            return require_trusted(value, _PARTS_WITHIN[key])
+            if key not in _NESTED_PARTS:
+                raise UntrustedTargetError(f"{key}._target_", "nothing can be built in this place")
+            return require_trusted(value, _NESTED_PARTS[key])
         for name, inner in value.items():
             if not isinstance(name, str | int) or str(name).startswith("_") or name == "defaults":
-                raise UntrustedTargetError(f"the key {name!r}", "it would tell Hydra what to do")
+                raise UntrustedTargetError(f"the key {name!r}", "Hydra would act on it")
             require_plain(inner, str(name))
     elif isinstance(value, list | tuple):
         for inner in value:
             require_plain(inner, key)
     elif not isinstance(value, str | int | float | None) or (isinstance(value, str) and "${" in value):
-        raise UntrustedTargetError(f"{key}={value!r}", "it is no plain value")
+        raise UntrustedTargetError(f"{key}={value!r}", "it is not a plain value")
     return None
 
 
 def _trusted(name: object, kind: type) -> Any:
-    """The class of that name, if it is of the kind and a trusted package defines it; or a function beside the kind."""
+    """The class of that name if it is of the kind and a trusted package defines it.
+
+    A public function also counts that is defined beside the kind and returns it, such as `sensors.hdl64`.
+    """
     allowed = f"it can only be a public {kind.__name__} that {' or '.join(p + '*' for p in TRUSTED_PACKAGES)} defines"
     if not isinstance(name, str) or not name.startswith(TRUSTED_PACKAGES) or "._" in name:
         raise UntrustedTargetError(f"_target_ {name!r}", allowed)
@@ -123,7 +126,7 @@ def _trusted(name: object, kind: type) -> Any:
         raise UserError(f"_target_ {name!r} does not exist: {error}") from error
     if inspect.isclass(target):
         trusted = issubclass(target, kind) and f"{target.__module__}.".startswith(TRUSTED_PACKAGES)
-    else:  # such as a sensor's function, that returns one
+    else:
         is_ours = inspect.isfunction(target) and target.__module__ == kind.__module__ == module_name
         trusted = is_ours and inspect.signature(target).return_annotation is kind
     if not trusted:

@@ -1,4 +1,4 @@
-"""The progress of a training, on a terminal and in a log file."""
+"""Progress of a training, on a terminal and in a log file."""
 
 import sys
 import time
@@ -14,13 +14,12 @@ _BAR = 20  # characters
 
 
 class ProgressLines(ProgressBar):
-    """A bar with the loss and the time left, and one line per epoch that stays.
+    """A bar with the loss and the time left, and a permanent line for each epoch.
 
-    On a terminal the bar moves in place. Into a file or a pipe a line is written now and then, so that a log stays
-    readable.
+    On a terminal the bar moves in place. A file or a pipe gets a line every now and then, so that a log stays readable.
 
     Args:
-        seconds_between_lines: at least so long between two lines within an epoch, where output is no terminal [s].
+        seconds_between_lines: least time between two lines within an epoch if the output is not a terminal [s].
     """
 
     def __init__(self, seconds_between_lines: float = 30.0) -> None:
@@ -34,7 +33,7 @@ class ProgressLines(ProgressBar):
         self._is_validated = False
 
     def disable(self) -> None:
-        """Show nothing, as Lightning asks all processes but the first to."""
+        """Show nothing; Lightning calls this in all processes but the first."""
         self._enabled = False
 
     def enable(self) -> None:
@@ -47,7 +46,7 @@ class ProgressLines(ProgressBar):
         self._first_epoch = trainer.current_epoch
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the epoch's clock."""
+        """Start the clock of the epoch."""
         self._share, self._is_validated = 0.0, False
         self._epoch_started = self._last_shown = time.monotonic()
         self._loss = torch.tensor(float("nan"))
@@ -56,23 +55,23 @@ class ProgressLines(ProgressBar):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Move the bar."""
-        # a number only where it is shown: to ask for it is to wait for the device
+        # stays a tensor until it is shown: converting it to a number waits for the device
         loss = (outputs["loss"] if isinstance(outputs, dict) else outputs).detach()
-        loss = loss * trainer.accumulate_grad_batches  # by which Lightning has divided it
+        loss = loss * trainer.accumulate_grad_batches  # Lightning has divided by it
         self._share = (batch_idx + 1) / max(1, trainer.num_training_batches)
         self._loss = loss if batch_idx == 0 else 0.95 * self._loss + 0.05 * loss
         terminal = sys.stdout.isatty()
-        ends = batch_idx + 1 >= trainer.num_training_batches and not terminal  # the epoch's own line follows
+        ends = batch_idx + 1 >= trainer.num_training_batches and not terminal  # the line of the epoch follows
         if not ends and time.monotonic() - self._last_shown >= (0.1 if terminal else self.seconds_between_lines):
             self._last_shown = time.monotonic()
             self._show(f"{self._head(trainer)}  loss {float(self._loss):.4g}  {self._left(trainer)}", terminal)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Errors are of this epoch."""
+        """Remember that the logged errors are from this epoch."""
         self._is_validated = True
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Leave a line with the epoch's mean loss and, if it was validated, its error."""
+        """Print a line with the mean loss of the epoch and, if it was validated, its error."""
         metrics = trainer.callback_metrics
         loss = float(metrics.get("train/loss_epoch", self._loss))
         took = _duration(time.monotonic() - self._epoch_started)
@@ -81,14 +80,14 @@ class ProgressLines(ProgressBar):
         self._show("  ".join(part for part in parts if part), in_place=False)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say what ended the training before its last epoch."""
+        """Print what ended the training before its last epoch."""
         within = "" if self._share >= 1 else " within an epoch"
         left = time_left_s(trainer)
         if left is not None and left <= 0:
             self._show(f"trainer.max_time is reached{within}", in_place=False)
         elif 0 < trainer.max_steps <= trainer.global_step:
             self._show(f"trainer.max_steps={trainer.max_steps} is reached{within}", in_place=False)
-        elif trainer.should_stop:  # else what they say is of an earlier training that this one goes on from
+        elif trainer.should_stop:  # otherwise their reason is that of an earlier training, which this one resumes
             for callback in trainer.early_stopping_callbacks:
                 if callback.stopping_reason_message:
                     self._show(f"EarlyStopping: {callback.stopping_reason_message}", in_place=False)
@@ -101,7 +100,7 @@ class ProgressLines(ProgressBar):
         return f"epoch {trainer.current_epoch + 1:>{len(str(last))}}/{last} [{bar}] {100 * min(share, 1.0):3.0f} %"
 
     def _left(self, trainer: Trainer) -> str:
-        """Time left, by the mean pace of this training."""
+        """Time left at the mean pace since this start."""
         done = trainer.current_epoch - self._first_epoch + self._share
         if not trainer.max_epochs or trainer.max_epochs < 0 or done <= 0:
             return ""
@@ -115,14 +114,14 @@ class ProgressLines(ProgressBar):
 
 
 def time_left_s(trainer: Trainer) -> float | None:
-    """Seconds of `trainer.max_time` that are left, None without such a limit."""
+    """Seconds left of `trainer.max_time`; None without such a limit."""
     callbacks = trainer.callbacks  # type: ignore[attr-defined]  # Lightning sets it without declaring it
     timers = (callback for callback in callbacks if isinstance(callback, Timer))
     return min((left for timer in timers if (left := timer.time_remaining()) is not None), default=None)
 
 
 def _errors(metrics: dict[str, Tensor]) -> list[str]:
-    """The validation errors that say most, with their units."""
+    """The most informative validation errors, with their units."""
     shown = {
         "val/avg_translation_error_percent": "avg translation error {:.2f} %",
         "val/mean_relative_translation_error_m": "relative translation error {:.3f} m",

@@ -1,4 +1,4 @@
-"""Schedules of the learning rate that go by steps."""
+"""Learning-rate schedules that are updated every step."""
 
 import math
 
@@ -7,15 +7,15 @@ from torch.optim.lr_scheduler import LambdaLR
 
 
 class WarmUpCosine(LambdaLR):
-    """Rises linearly to the optimizer's rate, then falls along half a cosine to nothing at the last step.
+    """Rises linearly to the optimizer's learning rate, then falls along half a cosine to zero at the last step.
 
-    A resumed training follows the schedule of its own number of steps, also where that has changed.
+    A resumed training follows the schedule for its own number of steps, even if that has changed.
 
     Args:
-        optimizer: whose rate it sets.
+        optimizer: the one whose learning rate is set.
         total_steps: of the whole training; filled in by `PoseNetModule`.
-        warm_up_share: share of the steps in which the rate rises.
-        start_share: where it begins, as a share of the optimizer's rate.
+        warm_up_share: share of the steps during which the rate rises.
+        start_share: rate at the first step, as a share of the optimizer's.
 
     Source: the fall after Loshchilov & Hutter, "SGDR", ICLR 2017.
     """

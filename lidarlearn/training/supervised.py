@@ -10,20 +10,20 @@ from lidarlearn.training.module import PoseNetModule
 
 
 class SupervisedModule(PoseNetModule):
-    """PoseNet trained by the distance of its estimates to the true relative poses.
+    """PoseNet trained to minimize the distance of its estimates to the true relative poses.
 
     Args: see `PoseNetModule`; the loss is the supervised one.
 
     Source: Dellenbach et al. 2021, III-B "Supervised training".
     """
 
-    needs_ground_truth = True  # which the datamodule sees to before it begins
+    needs_ground_truth = True  # checked by the datamodule before training starts
 
     def compute_loss(self, parameters: Float[Tensor, "batch 6"], batch: Pair) -> LossResult:
-        """Distance to ground truth.
+        """Distance to the ground truth.
 
         Raises:
-            UserError: a sequence has none.
+            UserError: a sequence has no ground truth.
         """
         if "T_ref_new" not in batch:
             raise UserError(

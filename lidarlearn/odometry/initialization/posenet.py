@@ -16,8 +16,8 @@ _PADDING = Padding()
 
 
 @runtime_checkable
-class TrainedNetwork(Protocol):
-    """The interface that a network needs: relative poses from pairs of vertex maps."""
+class RelativePoseNetwork(Protocol):
+    """What the initialization needs of a network: relative poses from pairs of vertex maps."""
 
     @property
     def projection(self) -> SphericalProjection:
@@ -40,7 +40,7 @@ class PoseNetInitialization(Initialization):
     Source: Dellenbach et al. 2021, III-A "Initialization", IV-C.
     """
 
-    def __init__(self, network: TrainedNetwork) -> None:
+    def __init__(self, network: RelativePoseNetwork) -> None:
         self._network = network
         self._previous: Tensor | None = None
         self._recordings = Recordings()
