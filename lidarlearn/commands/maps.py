@@ -10,6 +10,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from lidarlearn.data.sequence import DataSet, Sequence
+from lidarlearn.data.writable import atomic_write
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.map_figure import map_figure
 from lidarlearn.evaluation.maps import MapSettings, build_map
@@ -123,9 +124,8 @@ def _make_map(run: Path, export: Export, sequence: Sequence, settings: MapSettin
 def _keep(path: Path, row: dict[str, Any]) -> None:
     """Add the entry of a map to `maps.json`, replacing an earlier one of the same method and sequence."""
     others = [old for old in _kept(path) if (old["method"], old["sequence"]) != (row["method"], row["sequence"])]
-    draft = path.with_suffix(".tmp")
-    draft.write_text(json.dumps({"maps": [*others, row]}, indent=2) + "\n", encoding="utf-8")
-    draft.replace(path)
+    with atomic_write(path) as draft:
+        draft.write_text(json.dumps({"maps": [*others, row]}, indent=2) + "\n", encoding="utf-8")
 
 
 def _kept(path: Path) -> list[dict[str, Any]]:

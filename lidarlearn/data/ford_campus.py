@@ -26,14 +26,13 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
-from lidarlearn.data.pose_files import as_transforms, start_at_identity
+from lidarlearn.data.pose_files import start_at_identity, transforms_from_euler
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders, warn_of_gaps
 from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
@@ -222,5 +221,4 @@ def _field(path: Path, scan: np.void, name: str, rows: int) -> NDArray[Any]:
 
 def _from_degrees(poses: NDArray[np.float64]) -> Float[Tensor, "n 4 4"]:
     """Transforms of x, y, z [m], roll, pitch, yaw [deg] with R = Rz Ry Rx."""
-    R = Rotation.from_euler("ZYX", poses[:, [5, 4, 3]], degrees=True).as_matrix()
-    return as_transforms(torch.from_numpy(np.concatenate([R, poses[:, :3, None]], axis=2)))
+    return transforms_from_euler(poses[:, :3], np.radians(poses[:, 3:]))

@@ -8,7 +8,6 @@ number selects its row of poses and times, so a copy may hold any part of the sc
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -16,7 +15,7 @@ from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
-from lidarlearn.data.pose_files import as_transforms, read_kitti_poses, read_lines, read_times, start_at_identity
+from lidarlearn.data.pose_files import read_kitti_poses, read_labelled_transform, read_times, start_at_identity
 from lidarlearn.data.scan_files import (
     ScanFiles,
     is_folder,
@@ -97,7 +96,7 @@ class KittiOdometry(DataSetOnDisk):
         if not (folder / "calib.txt").is_file():
             raise self.not_found(name, f"sequences/{name}/calib.txt")
         warn_of_gaps(name, scans)
-        T_camera_lidar = read_velodyne_calibration(folder / "calib.txt")
+        T_camera_lidar = read_labelled_transform(folder / "calib.txt", "Tr:")
         return KittiOdometrySequence(
             name=name,
             scans=scans,
@@ -151,20 +150,6 @@ class KittiOdometry(DataSetOnDisk):
         times = read_times(path)
         _require_rows(path, len(times), scans)
         return times[scans.numbers]
-
-
-def read_velodyne_calibration(path: Path) -> Float[Tensor, "4 4"]:
-    """`Tr` of a KITTI odometry calib.txt: T_camera_lidar, to the left camera.
-
-    Raises:
-        DamagedFileError: no such line, or not twelve numbers.
-    """
-    lines = [line.partition(":")[2] for line in read_lines(path) if line.startswith("Tr:")]
-    try:
-        numbers = torch.tensor([float(value) for value in lines[0].split()], dtype=torch.float64)
-        return as_transforms(numbers.reshape(3, 4))
-    except (IndexError, ValueError, RuntimeError) as error:
-        raise DamagedFileError(path, "no line 'Tr:' with twelve numbers") from error
 
 
 def _require_rows(path: Path, rows: int, scans: ScanFiles) -> None:

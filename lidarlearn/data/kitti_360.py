@@ -25,7 +25,7 @@ from lidarlearn.data.oxts import read_timestamps
 from lidarlearn.data.pose_files import (
     StampedPoses,
     as_transforms,
-    read_lines,
+    read_labelled_transform,
     read_numbers,
     require_finite,
     start_at_identity,
@@ -173,25 +173,11 @@ class Kitti360(DataSetOnDisk):
         for path in paths:
             if not path.is_file():
                 raise self.not_found(name, str(path.relative_to(self.root)))
-        T_imu_camera = _transform(paths[0], "image_00:")
-        T_lidar_camera = _transform(paths[1], "")
+        T_imu_camera = read_labelled_transform(paths[0], "image_00:")
+        T_lidar_camera = read_labelled_transform(paths[1], "")
         return T_imu_camera @ torch.linalg.inv(T_lidar_camera)
 
 
 def drive_folder(name: str) -> str:
     """Folder of a drive: 0003 becomes 2013_05_28_drive_0003_sync."""
     return f"{_PREFIX}{name}{_SUFFIX}"
-
-
-def _transform(path: Path, label: str) -> Float[Tensor, "4 4"]:
-    """The transform on the line that begins with a label.
-
-    Raises:
-        DamagedFileError: no such line, or not twelve numbers.
-    """
-    lines = [line.removeprefix(label) for line in read_lines(path) if line.startswith(label)]
-    try:
-        numbers = torch.tensor([float(value) for value in lines[0].split()], dtype=torch.float64)
-        return as_transforms(numbers.reshape(3, 4))
-    except (IndexError, ValueError, RuntimeError) as error:
-        raise DamagedFileError(path, f"no line {label!r} with twelve numbers") from error

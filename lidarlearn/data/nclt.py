@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarlearn.data import layout
@@ -24,7 +23,7 @@ from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
-from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, start_at_identity
+from lidarlearn.data.pose_files import StampedPoses, read_numbers, start_at_identity, transforms_from_euler
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, read_bytes, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
@@ -170,9 +169,7 @@ def read_ground_truth(path: Path) -> StampedPoses:
         raise DamagedFileError(path, f"{len(rows)} rows without NaN")
     if (np.diff(rows[:, 0]) <= 0).any():
         raise DamagedFileError(path, "time stamps that do not ascend")
-    R = Rotation.from_euler("ZYX", rows[:, [6, 5, 4]]).as_matrix()
-    T = as_transforms(torch.from_numpy(np.concatenate([R, rows[:, 1:4, None]], axis=2)))
-    return StampedPoses(torch.from_numpy(rows[:, 0] * 1e-6), T)
+    return StampedPoses(torch.from_numpy(rows[:, 0] * 1e-6), transforms_from_euler(rows[:, 1:4], rows[:, 4:]))
 
 
 def _timestamps(scans: ScanFiles) -> Float[Tensor, "n"]:

@@ -21,9 +21,10 @@ from lidarlearn.data.cloud_files import note_returns, read_cloud
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
-from lidarlearn.data.pose_files import StampedPoses, as_transforms, read_numbers, stamped_poses, start_at_identity
+from lidarlearn.data.pose_files import StampedPoses, read_numbers, stamped_poses, start_at_identity
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan
+from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 
 BEAMS, COLUMNS = 64, 1024
@@ -32,8 +33,8 @@ PERIOD_S = 0.1
 
 def _left_camera_to_lidar() -> Float[Tensor, "4 4"]:
     """T_camera_lidar. Source: the data set's calibration, as in pyLiDAR-SLAM and KISS-ICP."""
-    R = Rotation.from_quat([0.0, 0.0, 0.924, 0.383]).as_matrix()
-    return as_transforms(torch.from_numpy(np.column_stack([R, [-0.084, -0.025, 0.050]])))
+    R = torch.from_numpy(Rotation.from_quat([0.0, 0.0, 0.924, 0.383]).as_matrix())
+    return se3.from_rotation_translation(R, torch.tensor([-0.084, -0.025, 0.050], dtype=torch.float64))
 
 
 T_CAMERA_LIDAR = _left_camera_to_lidar()

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.pose_files import as_transforms, read_lines, read_numbers, require_finite
+from lidarlearn.data.pose_files import read_lines, read_numbers, require_finite, transforms_from_euler
 from lidarlearn.data.scan_files import ScanFiles
+from lidarlearn.geometry import se3
 
 EARTH_RADIUS_M = 6378137.0
 _COLUMNS = 30
@@ -32,8 +32,7 @@ def read_oxts_poses(packets: ScanFiles) -> Float[Tensor, "n 4 4"]:
         rows.append(row)
     latitude, longitude, altitude, roll, pitch, yaw = np.concatenate(rows).T
     position = mercator(latitude, longitude, altitude)
-    R = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
-    return as_transforms(torch.from_numpy(np.concatenate([R, position[:, :, None]], axis=2)))
+    return transforms_from_euler(position, np.stack([roll, pitch, yaw], axis=1))
 
 
 def mercator(
@@ -77,7 +76,7 @@ def read_rigid_transform(path: Path) -> Float[Tensor, "4 4"]:
     entries = dict(line.split(":", 1) for line in read_lines(path) if ":" in line)
     try:
         R = torch.tensor([float(v) for v in entries["R"].split()], dtype=torch.float64).reshape(3, 3)
-        t = torch.tensor([float(v) for v in entries["T"].split()], dtype=torch.float64).reshape(3, 1)
+        t = torch.tensor([float(v) for v in entries["T"].split()], dtype=torch.float64).reshape(3)
     except (KeyError, ValueError, RuntimeError) as error:
         raise DamagedFileError(path, "no lines 'R:' with nine and 'T:' with three numbers") from error
-    return as_transforms(torch.cat([R, t], dim=1))
+    return se3.from_rotation_translation(R, t)

@@ -1,4 +1,4 @@
-"""Ground truth and calibration as text: rows of numbers, KITTI's 3x4 poses, TUM's stamped quaternions."""
+"""Poses, times and calibrations as text: rows of numbers, KITTI's 3x4 matrices, TUM's stamped quaternions."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.geometry import se3
 
 
 @dataclass(frozen=True)
@@ -117,8 +118,67 @@ def stamped_poses(path: Path, rows: NDArray[np.float64]) -> StampedPoses:
     if (np.linalg.norm(rows[:, 4:], axis=1) < 0.5).any():
         raise DamagedFileError(path, "a quaternion that is not of length 1")
     require_ascending(path, rows[:, 0])
-    T = as_transforms(torch.from_numpy(np.dstack([Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4, None]])))
+    R = torch.from_numpy(Rotation.from_quat(rows[:, 4:]).as_matrix())
+    T = se3.from_rotation_translation(R, torch.from_numpy(rows[:, 1:4]))
     return StampedPoses(torch.from_numpy(rows[:, 0].copy()), T)
+
+
+def read_labelled_transform(path: Path, label: str) -> Float[Tensor, "4 4"]:
+    """The transform on the first line that begins with `label`, as twelve numbers; `Tr:` of KITTI's calib.txt.
+
+    Raises:
+        DamagedFileError: no such line, or not twelve numbers.
+    """
+    lines = [line.removeprefix(label) for line in read_lines(path) if line.startswith(label)]
+    try:
+        numbers = torch.tensor([float(value) for value in lines[0].split()], dtype=torch.float64)
+        return as_transforms(numbers.reshape(3, 4))
+    except (IndexError, ValueError, RuntimeError) as error:
+        raise DamagedFileError(path, f"no line {label!r} with twelve numbers") from error
+
+
+def write_times(path: Path, timestamps: Float[Tensor, "n"]) -> None:
+    """Write times [s], one a row, to the nanosecond."""
+    path.write_text("".join(f"{time:.9f}\n" for time in timestamps.tolist()), encoding="utf-8")
+
+
+def write_kitti_poses(path: Path | str, T_world: Float[Tensor, "n 4 4"]) -> None:
+    """Write poses in KITTI's format, see `kitti_row`; makes the folder."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"{kitti_row(T)}\n" for T in T_world), encoding="utf-8")
+
+
+def kitti_row(T: Float[Tensor, "4 4"]) -> str:
+    """The upper three rows of a transform as twelve numbers of 13 significant digits."""
+    return " ".join(f"{value:.12e}" for value in T[:3].flatten().tolist())
+
+
+def write_tum_poses(path: Path | str, T_world: Float[Tensor, "n 4 4"], timestamps: Float[Tensor, "n"] | None) -> None:
+    """Write poses in TUM's format: time [s], position [m], quaternion (x y z w), w >= 0; makes the folder.
+
+    Args:
+        path: of the file.
+        T_world: the poses.
+        timestamps: of each pose [s]; None writes the number of the frame instead.
+    """
+    times = torch.arange(len(T_world), dtype=torch.float64) if timestamps is None else timestamps
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8") as file:
+        file.write("# time [s] tx ty tz [m] qx qy qz qw\n")
+        if not len(T_world):
+            return
+        quaternions = Rotation.from_matrix(T_world[:, :3, :3].cpu().numpy()).as_quat(canonical=True)
+        rows = np.concatenate([T_world[:, :3, 3].cpu().numpy(), quaternions], axis=1)
+        for time, row in zip(times.tolist(), rows, strict=True):
+            file.write(f"{time:.9f} " + " ".join(f"{value:.12e}" for value in row) + "\n")
+
+
+def transforms_from_euler(position: NDArray[np.float64], roll_pitch_yaw: NDArray[np.float64]) -> Float[Tensor, "n 4 4"]:
+    """Transforms from positions [m] and angles [rad], both (n, 3), with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    R = Rotation.from_euler("ZYX", roll_pitch_yaw[:, ::-1]).as_matrix()
+    return se3.from_rotation_translation(torch.from_numpy(R), torch.from_numpy(position))
 
 
 def as_transforms(top: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 4 4"]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarlearn.data.writable import atomic_write
 from lidarlearn.progress import progress
 from lidarlearn.simulation.drive import Drive
 
@@ -81,14 +82,6 @@ def _work(
         for index in indices:
             if stop.is_set():
                 return
-            _write(drive, folder, index)
+            with atomic_write(image_path(folder, index)) as draft, draft.open("wb") as file:
+                np.save(file, drive.ranges(index))
             advance()
-
-
-def _write(drive: Drive, folder: Path, index: int) -> None:
-    """Write one range image so that it is either whole or not there."""
-    path = image_path(folder, index)
-    draft = path.with_suffix(".tmp")
-    with draft.open("wb") as file:
-        np.save(file, drive.ranges(index))
-    draft.replace(path)

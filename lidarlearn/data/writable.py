@@ -1,9 +1,19 @@
-"""Folders to write to."""
+"""Folders that can be written to, and files that are whole or absent."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 
 from lidarlearn.errors import UserError
+
+
+@contextmanager
+def atomic_write(path: Path) -> Iterator[Path]:
+    """The path of a draft beside `path`, which takes its place at the end: `path` is never half written."""
+    draft = path.with_suffix(".tmp")
+    yield draft
+    draft.replace(path)
 
 
 def writable(folder: Path, remedy: str) -> Path:

@@ -13,7 +13,7 @@ from lidarlearn.data.ply import write_ply
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
-from lidarlearn.geometry.normals import fit_planes
+from lidarlearn.geometry.normals import covariances_of, fit_planes
 from lidarlearn.geometry.ranges import in_range
 from lidarlearn.geometry.voxels import VoxelSums, voxel_cells
 from lidarlearn.odometry.deskew import deskew
@@ -156,9 +156,7 @@ def mean_plane_variance(sums: Float[Tensor, "m 10"]) -> float | None:
     if not len(sums):
         return None
     means = sums[:, 1:] / sums[:, :1]
-    x, y, z = means[:, :3].unbind(1)
-    covariances = means[:, 3:] - torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], dim=1)
-    return fit_planes(covariances).variances[:, 0].mean().item()
+    return fit_planes(covariances_of(means[:, :3], means[:, 3:])).variances[:, 0].mean().item()
 
 
 def _in_range(scan: Scan, settings: MapSettings) -> Scan:

@@ -12,15 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarlearn.data.pose_files import write_kitti_poses, write_tum_poses
 from lidarlearn.data.sequence import Sequence
+from lidarlearn.data.writable import atomic_write
 from lidarlearn.errors import UserError
-from lidarlearn.evaluation.trajectory_files import (
-    read_trajectory,
-    to_lidar_frame,
-    to_reference_frame,
-    write_kitti,
-    write_tum,
-)
+from lidarlearn.evaluation.trajectory_files import read_trajectory, to_lidar_frame, to_reference_frame
 from lidarlearn.odometry.health import Health, write_health
 from lidarlearn.odometry.scan_by_scan import ScanByScan
 
@@ -144,14 +140,13 @@ def _write(
 ) -> None:
     T_world = to_reference_frame(torch.stack(poses), sequence.T_reference_lidar)
     timestamps = None if sequence.timestamps is None else sequence.timestamps[: len(poses)]
-    write_kitti(export.kitti, T_world)
-    write_tum(export.tum, T_world, timestamps)
+    write_kitti_poses(export.kitti, T_world)
+    write_tum_poses(export.tum, T_world, timestamps)
     write_health(export.health, records)
     speed = len(poses) / max(seconds, 1e-9)
     summary = {"frames_per_second": speed, "health": summarize_health(records), "settings": settings or {}}
-    draft = export.summary.with_suffix(".tmp")
-    draft.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    draft.replace(export.summary)
+    with atomic_write(export.summary) as draft:
+        draft.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -1,13 +1,11 @@
-"""Trajectory files: KITTI's (a 3x4 matrix a row) and TUM's (time, position, quaternion), and the frame they are in."""
+"""Find and read trajectory files in KITTI's and TUM's format, and convert the frame that their poses are in."""
 
 from collections.abc import Iterator
 from collections.abc import Sequence as Series
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarlearn.data.pose_files import read_kitti_poses, read_tum_poses
@@ -23,33 +21,6 @@ _MAX_DEVIATION = 1e-2  # of R R^T from the identity; some tools write three digi
 
 class TrajectoryError(UserError):
     """A trajectory file that is missing, cannot be read, or does not belong to its sequence."""
-
-
-def write_kitti(path: Path | str, T_world: Float[Tensor, "n 4 4"]) -> None:
-    """Write poses in KITTI's format: the 12 numbers of the upper 3x4 matrix a row, 13 significant digits."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    np.savetxt(path, T_world[:, :3].flatten(1).cpu().numpy(), fmt="%.12e")
-
-
-def write_tum(path: Path | str, T_world: Float[Tensor, "n 4 4"], timestamps: Float[Tensor, "n"] | None) -> None:
-    """Write poses in TUM's format: time [s], position [m], quaternion (x y z w), w >= 0.
-
-    Args:
-        path: file to write; its folder is made.
-        T_world: absolute poses.
-        timestamps: of each pose [s]; None writes the number of the frame in its place.
-    """
-    times = torch.arange(len(T_world), dtype=torch.float64) if timestamps is None else timestamps
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8") as file:
-        file.write("# time [s] tx ty tz [m] qx qy qz qw\n")
-        if not len(T_world):
-            return
-        quaternions = Rotation.from_matrix(T_world[:, :3, :3].cpu().numpy()).as_quat(canonical=True)
-        rows = np.concatenate([T_world[:, :3, 3].cpu().numpy(), quaternions], axis=1)
-        for time, row in zip(times.tolist(), rows, strict=True):
-            file.write(f"{time:.9f} " + " ".join(f"{value:.12e}" for value in row) + "\n")
 
 
 def read_trajectory(

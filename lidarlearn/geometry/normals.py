@@ -38,6 +38,14 @@ def fit_planes(covariances: Float[Tensor, "*batch 6"]) -> PlaneFit:
     return PlaneFit(torch.stack(normal).movedim(0, -1), torch.stack(variances).movedim(0, -1))
 
 
+def covariances_of(
+    means: Float[Tensor, "*batch 3"], square_means: Float[Tensor, "*batch 6"]
+) -> Float[Tensor, "*batch 6"]:
+    """Covariances from the means of x, y, z and of their products; components in the order of `fit_planes`."""
+    x, y, z = means.unbind(-1)
+    return square_means - torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], dim=-1)
+
+
 def _fit(s: _Symmetric) -> tuple[_Vector, _Vector]:
     """Components of the normals and variances, see `fit_planes`."""
     tiny = torch.finfo(s[0].dtype).tiny

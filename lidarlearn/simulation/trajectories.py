@@ -9,7 +9,8 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from lidarlearn.errors import UserError
+from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.pose_files import read_kitti_poses
 from lidarlearn.simulation.terrain import Terrain
 
 # Axes of KITTI's left camera (x right, y down, z forward) in the LiDAR's (x forward, y left, z up).
@@ -114,16 +115,11 @@ def read_poses(path: Path, camera: bool) -> Float[np.ndarray, "n 4 4"]:
             are turned into the LiDAR's, the lever arm between the two is left out.
 
     Raises:
-        UserError: the file is missing or does not hold two rows of 12 finite numbers.
+        DamagedFileError: the file is missing or does not hold two rows of 12 finite numbers.
     """
-    try:
-        rows = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as problem:
-        raise UserError(f"pose file {path}: {problem}; give a file in KITTI's format, 12 numbers a row") from problem
-    if rows.shape[0] < 2 or rows.shape[1] != 12 or not np.isfinite(rows).all():
-        raise UserError(f"pose file {path}: shape {rows.shape}; expected two or more rows of 12 finite numbers")
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = rows.reshape(-1, 3, 4)
+    poses = read_kitti_poses(path).numpy()
+    if len(poses) < 2:
+        raise DamagedFileError(path, "a single pose, at least two are needed", "data.pose_file to a drive's poses")
     if camera:
         C = np.eye(4)
         C[:3, :3] = _R_LIDAR_CAMERA

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarlearn.commands import evaluate
-from lidarlearn.evaluation.trajectory_files import write_kitti
+from lidarlearn.data.pose_files import write_kitti_poses
 from tests.box_world import BoxSequence
 from tests.commands.scans import FRAMES, SENSOR
 
@@ -20,7 +20,7 @@ def scans(tmp_path_factory):
         (root / name).mkdir()
         for i, scan in enumerate(drive):
             np.save(root / name / f"{i}.npy", scan.points.numpy())
-        write_kitti(root / name / "poses.txt", drive.T_world_lidar)
+        write_kitti_poses(root / name / "poses.txt", drive.T_world_lidar)
     return root
 
 

@@ -4,13 +4,13 @@ import json
 
 import pytest
 
+from lidarlearn.data.pose_files import write_kitti_poses
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.compare import comparable_groups, comparison, read_run
 from lidarlearn.evaluation.report import write_report, write_results
 from lidarlearn.evaluation.run import Export
 from lidarlearn.evaluation.score import score
 from lidarlearn.evaluation.table_layout import TableLayout
-from lidarlearn.evaluation.trajectory_files import write_kitti
 
 PROTOCOL = {"data": "towns", "beam_correction_deg": 0.0, "deskew": False, "max_frames": None}
 
@@ -26,7 +26,7 @@ def make_run(tmp_path, make_sequence, longer):
         write_report(folder, stamp, [score(method, T_world, drive, 10.0)], layout=layout)
         if settings is not None:
             export = Export(folder / "trajectories" / method, sequence)
-            write_kitti(export.kitti, T_world)
+            write_kitti_poses(export.kitti, T_world)
             export.summary.write_text(json.dumps({"settings": {"scans": "f00d"} | settings}))
         return folder
 

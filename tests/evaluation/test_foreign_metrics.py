@@ -6,8 +6,9 @@ import torch
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 
+from lidarlearn.data.pose_files import write_kitti_poses
 from lidarlearn.evaluation.score import score
-from lidarlearn.evaluation.trajectory_files import read_trajectory, to_lidar_frame, write_kitti
+from lidarlearn.evaluation.trajectory_files import read_trajectory, to_lidar_frame
 from lidarlearn.geometry import se3
 
 
@@ -19,7 +20,7 @@ def test_ten_trajectories_agree_with_kiss_icp_and_evo(tmp_path, make_sequence, T
     noise *= torch.tensor([0.03, 0.01, 0.01, 5e-4, 5e-4, 1e-3], dtype=torch.float64)
     T_world_lidar = se3.accumulate(se3.relative(sequence.T_world_lidar) @ se3.exp(noise[1:]))
     T_world_camera = T_camera_lidar @ T_world_lidar @ se3.inverse(T_camera_lidar)
-    write_kitti(tmp_path / "00.txt", T_world_camera)
+    write_kitti_poses(tmp_path / "00.txt", T_world_camera)
 
     poses = read_trajectory(tmp_path / "00.txt", sequence.timestamps)
     lidar = to_lidar_frame(poses, "camera", sequence.reference_frame, sequence.T_reference_lidar)

@@ -2,9 +2,9 @@
 
 import zipfile
 
+from lidarlearn.data.pose_files import write_kitti_poses
 from lidarlearn.evaluation.run import Export
 from lidarlearn.evaluation.submission import KITTI_TEST_FRAMES, is_kitti_test_set, write_submission
-from lidarlearn.evaluation.trajectory_files import write_kitti
 from tests.evaluation.conftest import DriveWithoutScans
 
 
@@ -22,7 +22,7 @@ def test_only_all_eleven_whole_sequences_can_be_handed_in(T_camera_lidar):
 
 def test_the_files_lie_side_by_side_with_a_pose_a_row(tmp_path, make_drive):
     for name in KITTI_TEST_FRAMES:
-        write_kitti(Export(tmp_path / "cv+p_f2m", name).kitti, make_drive(7))
+        write_kitti_poses(Export(tmp_path / "cv+p_f2m", name).kitti, make_drive(7))
     with zipfile.ZipFile(write_submission(tmp_path / "submission.zip", tmp_path / "cv+p_f2m")) as archive:
         assert archive.namelist() == [f"{i}.txt" for i in range(11, 22)]
         rows = archive.read("15.txt").decode().splitlines()

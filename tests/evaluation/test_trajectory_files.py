@@ -3,6 +3,7 @@ import pytest
 import torch
 from evo.tools import file_interface
 
+from lidarlearn.data.pose_files import write_kitti_poses, write_tum_poses
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.trajectory_files import (
     TrajectoryError,
@@ -11,8 +12,6 @@ from lidarlearn.evaluation.trajectory_files import (
     read_trajectory,
     to_lidar_frame,
     to_reference_frame,
-    write_kitti,
-    write_tum,
 )
 from lidarlearn.geometry import se3
 
@@ -33,13 +32,13 @@ def write(tmp_path, text):
 
 
 def test_kitti_round_trip(tmp_path, poses):
-    write_kitti(tmp_path / "new" / "00.txt", poses)
+    write_kitti_poses(tmp_path / "new" / "00.txt", poses)
     assert torch.allclose(read_trajectory(tmp_path / "new" / "00.txt"), poses, rtol=1e-12, atol=1e-12)
 
 
 def test_kitti_files_have_nine_digits_and_evo_reads_them(tmp_path, poses):
     path = tmp_path / "00.txt"
-    write_kitti(path, poses)
+    write_kitti_poses(path, poses)
     words = path.read_text().split()
     assert len(words) == 12 * 30
     assert all(len(word.split("e")[0].strip("-").replace(".", "")) >= 9 for word in words)
@@ -48,7 +47,7 @@ def test_kitti_files_have_nine_digits_and_evo_reads_them(tmp_path, poses):
 
 def test_tum_round_trip_and_evo_reads_it(tmp_path, poses):
     path = tmp_path / "00.tum"
-    write_tum(path, poses, TIMES)
+    write_tum_poses(path, poses, TIMES)
     assert torch.allclose(read_trajectory(path, TIMES), poses, rtol=1e-10, atol=1e-10)
     evo = file_interface.read_tum_trajectory_file(str(path))
     np.testing.assert_allclose(evo.poses_se3, poses.numpy(), rtol=1e-9, atol=1e-9)
@@ -57,21 +56,21 @@ def test_tum_round_trip_and_evo_reads_it(tmp_path, poses):
 
 def test_tum_without_times_counts_frames(tmp_path, poses):
     path = tmp_path / "00.tum"
-    write_tum(path, poses, None)
+    write_tum_poses(path, poses, None)
     assert torch.allclose(read_trajectory(path), poses, rtol=1e-10, atol=1e-10)
     assert np.loadtxt(path)[:, 0].tolist() == list(range(30))
 
 
 def test_files_may_be_named_by_a_string(tmp_path, poses):
-    write_kitti(f"{tmp_path}/new/00.txt", poses)
-    write_tum(f"{tmp_path}/newer/00.tum", poses, TIMES)
+    write_kitti_poses(f"{tmp_path}/new/00.txt", poses)
+    write_tum_poses(f"{tmp_path}/newer/00.tum", poses, TIMES)
     for path in (tmp_path / "new" / "00.txt", tmp_path / "newer" / "00.tum"):
         assert torch.allclose(read_trajectory(path), poses, rtol=1e-10, atol=1e-10)
 
 
 def test_each_scan_takes_the_tum_pose_nearest_in_time(tmp_path, poses):
     path = tmp_path / "00.tum"
-    write_tum(path, poses, TIMES)
+    write_tum_poses(path, poses, TIMES)
     scans = TIMES[[3, 8, 29]] + torch.tensor([0.004, -0.004, 0.009], dtype=torch.float64)
     assert torch.allclose(read_trajectory(path, scans), poses[[3, 8, 29]], rtol=1e-10, atol=1e-10)
 
@@ -79,7 +78,7 @@ def test_each_scan_takes_the_tum_pose_nearest_in_time(tmp_path, poses):
 @pytest.mark.parametrize("shift", [0.05, -0.05, 3600.0, -1.3e9])
 def test_scans_without_a_pose_near_in_time_are_refused(tmp_path, poses, shift):
     path = tmp_path / "00.tum"
-    write_tum(path, poses, TIMES)
+    write_tum_poses(path, poses, TIMES)
     with pytest.raises(TrajectoryError, match=r"30 of 30 scans have no pose within 0.01 s, the first is scan 0"):
         read_trajectory(path, TIMES + shift)
 
@@ -87,7 +86,7 @@ def test_scans_without_a_pose_near_in_time_are_refused(tmp_path, poses, shift):
 def test_a_missing_tum_pose_is_named(tmp_path, poses):
     path = tmp_path / "00.tum"
     kept = [i for i in range(30) if i != 17]
-    write_tum(path, poses[kept], TIMES[kept])
+    write_tum_poses(path, poses[kept], TIMES[kept])
     with pytest.raises(TrajectoryError, match=r"1 of 30 scans have no pose within 0.01 s, the first is scan 17"):
         read_trajectory(path, TIMES)
 

@@ -127,7 +127,6 @@ def test_camera_poses_turn_into_the_lidars_axes(tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "1 2 3\n4 5 6\n", "a b\n", "1 0 0 0 0 1 0 0 0 0 1 nan\n" * 2])
-@pytest.mark.filterwarnings("ignore:loadtxt:UserWarning")  # numpy's words about the empty file
 def test_a_damaged_pose_file_is_named(tmp_path, content):
     (tmp_path / "bad.txt").write_text(content)
     with pytest.raises(UserError, match=r"bad\.txt"):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lidarlearn import cuda_graphs
 from lidarlearn.errors import require_positive
-from lidarlearn.geometry.normals import fit_planes
+from lidarlearn.geometry.normals import covariances_of, fit_planes
 from lidarlearn.geometry.voxels import grid_sample, voxel_cells
 from lidarlearn.registration.association.point_buffer import PointBuffer
 
@@ -156,9 +156,7 @@ class VoxelMap(PointBuffer):
             slots = self._distinct(slots)
         moments = self._moments[slots]
         n = moments[:, :1] + 1  # the point itself, at offset zero
-        mx, my, mz = (moments[:, 1:4] / n).unbind(-1)
-        outer = torch.stack([mx * mx, mx * my, mx * mz, my * my, my * mz, mz * mz], dim=1)
-        plane = fit_planes(moments[:, 4:] / n - outer)
+        plane = fit_planes(covariances_of(moments[:, 1:4] / n, moments[:, 4:] / n))
         smallest_extent = _MIN_EXTENT * self.voxel_size_m
         self._normals[slots] = plane.normals * _is_plane(moments[:, 0], plane.variances, smallest_extent)[:, None]
 
