@@ -3,7 +3,6 @@
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from collections.abc import Sequence as Series
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,7 +54,7 @@ class Evaluation:
 
     sequences: Mapping[str, Sequence]
     T_world_lidar: Mapping[str, Mapping[str, Tensor]]
-    scores: Series[Score]
+    scores: list[Score]
 
 
 def evaluate(config: DictConfig, data_name: str) -> Evaluation:
@@ -107,7 +106,7 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
 
 def _own(
     config: DictConfig,
-    methods: Series[Method],
+    methods: list[Method],
     networks: Mapping[str, Mapping[str, Any]],
     sequences: Mapping[str, Sequence],
     run_folder: Path,

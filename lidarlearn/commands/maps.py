@@ -1,7 +1,7 @@
 """`python -m lidarlearn.evaluation map`: maps from the trajectories of an evaluation and the scans."""
 
 import json
-from collections.abc import Sequence as Series
+from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
@@ -23,7 +23,7 @@ from lidarlearn.training.parts import require_trusted
 
 
 def make_maps(
-    run: Path, method: str | None, sequence: str | None, settings: MapSettings, overrides: Series[str] = ()
+    run: Path, method: str | None, sequence: str | None, settings: MapSettings, overrides: Collection[str] = ()
 ) -> None:
     """Write a map and a picture for each method and sequence of a run, and `maps.json`; print a table of the maps.
 
@@ -52,7 +52,7 @@ def make_maps(
     print(f"maps: {run / 'maps'}")
 
 
-def _config_of(run: Path, overrides: Series[str]) -> DictConfig:
+def _config_of(run: Path, overrides: Collection[str]) -> DictConfig:
     """The configuration of the run, with the overrides applied to its data set."""
     path = run / "config.yaml"
     if not path.is_file() or not (run / "trajectories").is_dir():
@@ -140,7 +140,7 @@ def _kept(path: Path) -> list[dict[str, Any]]:
         ) from error
 
 
-def _table(rows: Series[dict[str, Any]]) -> Table:
+def _table(rows: list[dict[str, Any]]) -> Table:
     cells = [
         (
             row["method"],

@@ -3,7 +3,6 @@
 import itertools
 import json
 from collections.abc import Iterable, Mapping, Set
-from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,7 @@ class Run:
 
     folder: Path
     protocol: Mapping[str, Any]
-    scores: Series[Score]
+    scores: list[Score]
     settings: Mapping[tuple[str, str], Settings]
     layout: TableLayout | None = None
 
@@ -55,8 +54,8 @@ class Group:
         seen: methods, by these names, and sequences on which their networks were trained.
     """
 
-    runs: Series[Run]
-    scores: Series[Score]
+    runs: list[Run]
+    scores: list[Score]
     seen: Set[tuple[str, str]]
 
     @property
@@ -126,7 +125,7 @@ def comparable_groups(runs: Iterable[Run]) -> list[Group]:
     return [_group(runs) for runs in groups]
 
 
-def comparison(groups: Series[Group]) -> tuple[dict[str, Any], list[Table], str]:
+def comparison(groups: list[Group]) -> tuple[dict[str, Any], list[Table], str]:
     """What to write and print about groups of runs: content of `results.json`, tables, and a last section.
 
     Where all runs are of one experiment, its table comes first, with the rows of all of them; or one for each group, if
@@ -152,7 +151,7 @@ def comparison(groups: Series[Group]) -> tuple[dict[str, Any], list[Table], str]
     return content, tables, _closing(groups)
 
 
-def _closing(groups: Series[Group]) -> str:
+def _closing(groups: list[Group]) -> str:
     lines = ["### Runs", ""]
     for i, group in enumerate(groups):
         prefix = "" if len(groups) == 1 else f"{i + 1}. "
@@ -172,7 +171,7 @@ def _measured_with(run: Run) -> str:
     return ", ".join(f"{key} {run.protocol[key]}" for key in keys if key in run.protocol)
 
 
-def _group(runs: Series[Run]) -> Group:
+def _group(runs: list[Run]) -> Group:
     """All rows, sequence by sequence within each method."""
     by_method: dict[str, dict[str, list[Score]]] = {}
     seen = set()
@@ -186,7 +185,7 @@ def _group(runs: Series[Run]) -> Group:
     return Group(runs, scores, seen)
 
 
-def _labels(runs: Series[Run]) -> list[dict[tuple[str, str], str]]:
+def _labels(runs: list[Run]) -> list[dict[tuple[str, str], str]]:
     """What to call each method and sequence of each run: methods whose settings differ say by what.
 
     What several runs have alike is told apart by their folders, but for the first of them.
@@ -205,14 +204,14 @@ def _labels(runs: Series[Run]) -> list[dict[tuple[str, str], str]]:
     return result
 
 
-def _distinct_folders(runs: Series[Run]) -> list[str]:
+def _distinct_folders(runs: list[Run]) -> list[str]:
     """The shortest ends of the runs' paths that tell all of them apart."""
     paths = [run.folder.resolve().parts for run in runs]
     length = next(n for n in itertools.count(1) if len({path[-n:] for path in paths}) == len(set(paths)))
     return ["/".join(path[-length:]) for path in paths]
 
 
-def _variation(settings: Settings, variants: Series[Settings]) -> str:
+def _variation(settings: Settings, variants: list[Settings]) -> str:
     """Those settings that differ between the variants, in brackets, by the last words of their names where these do.
 
     A part is called by its class, as in "weight=Huber". The sensor's projection belongs to the data. Variants of which

@@ -5,8 +5,7 @@ by more than a registration: against a map of scans of KITTI 04 at their true po
 """
 
 import math
-from collections.abc import Callable, Mapping
-from collections.abc import Sequence as Series
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -40,8 +39,8 @@ class Probe:
         success_deg: ...and turned by less [deg].
     """
 
-    offsets_m: Series[float] = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0)
-    angles_deg: Series[float] = (2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 30.0)
+    offsets_m: Collection[float] = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0)
+    angles_deg: Collection[float] = (2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 30.0)
     directions: int = 6
     every: int = 20
     min_range_m: float = 2.5

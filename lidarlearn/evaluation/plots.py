@@ -5,8 +5,7 @@ Figures are made without pyplot, whose list of open figures would grow with a tr
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from collections.abc import Sequence as Series
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,7 +92,7 @@ class Panel:
     curves: Mapping[str, Mapping[float, float]]
 
 
-def curves_figure(title: str, panels: Series[Panel]) -> Figure:
+def curves_figure(title: str, panels: list[Panel]) -> Figure:
     """Panels side by side, with one legend for the names that they share."""
     figure = Figure(figsize=(10, 4), dpi=_DPI, layout="constrained")
     row = figure.subplots(1, len(panels), squeeze=False)[0]
@@ -161,8 +160,8 @@ def frame_error_figure(title: str, T_true: Poses, T_estimates: Mapping[str, Pose
 def figures(
     sequences: Mapping[str, Sequence],
     T_world_lidar: Mapping[str, Mapping[str, Poses]],
-    scores: Series[Score],
-    groups: Mapping[str, Series[str]] | None = None,
+    scores: list[Score],
+    groups: Mapping[str, Collection[str]] | None = None,
 ) -> Iterator[tuple[str, Figure]]:
     """All figures of an evaluation, one by one, with the names of their files.
 
@@ -223,7 +222,7 @@ def _bird_eye(T_world: Poses) -> Float[Tensor, "n 2"]:
     return (se3.inverse(T_world[:1]) @ T_world)[:, :2, 3].cpu()
 
 
-def _view(paths: Series[Float[Tensor, "_ 2"]], truth: Float[Tensor, "n 2"] | None) -> Float[Tensor, "2 2"]:
+def _view(paths: list[Float[Tensor, "_ 2"]], truth: Float[Tensor, "n 2"] | None) -> Float[Tensor, "2 2"]:
     """Lower and upper corner of what is shown [m]: everything, unless a path leaves the truth far behind."""
     points = torch.cat(list(paths))
     corners = torch.stack([points.amin(0), points.amax(0)])

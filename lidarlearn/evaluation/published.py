@@ -10,7 +10,6 @@ is the Table I of "What's in My LiDAR Odometry Toolbox?"; "re-run": with the rel
 """
 
 from collections.abc import Iterable
-from collections.abc import Sequence as Series
 from dataclasses import dataclass
 
 from lidarlearn.evaluation.score import Score
@@ -45,7 +44,7 @@ class Published:
     errors_percent: dict[str, str]
     segment_mean_percent: str = ""
 
-    def sequence_mean_percent(self, sequences: Series[str]) -> float | None:
+    def sequence_mean_percent(self, sequences: list[str]) -> float | None:
         """Mean over the given sequences; None unless every one of them is published."""
         if not sequences or any(name not in self.errors_percent for name in sequences):
             return None

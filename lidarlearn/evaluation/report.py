@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
-from collections.abc import Sequence as Series
 from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
@@ -35,7 +34,7 @@ Seen = Collection[tuple[str, str]]  # methods and sequences on which their netwo
 def write_report(
     folder: Path,
     protocol: Mapping[str, Any],
-    scores: Series[Score],
+    scores: list[Score],
     seen: Seen = (),
     layout: TableLayout | None = None,
 ) -> None:
@@ -56,7 +55,7 @@ def write_report(
     write_results(folder, results, tables, protocol_markdown(protocol))
 
 
-def write_results(folder: Path, results: Mapping[str, Any], tables: Series[Table], closing: str) -> None:
+def write_results(folder: Path, results: Mapping[str, Any], tables: list[Table], closing: str) -> None:
     """Write `results.json`, and `results.md` with some tables and a last section.
 
     Raises:
@@ -77,13 +76,13 @@ def seen_in_training(protocol: Mapping[str, Any], scores: Iterable[Score]) -> se
     return {(method, sequence) for method, sequence in rows if sequence in names.get(method.partition("+")[0], ())}
 
 
-def results_content(scores: Series[Score]) -> dict[str, Any]:
+def results_content(scores: list[Score]) -> dict[str, Any]:
     """Scores and their averages as `results.json` holds them."""
     averages = average_scores(scores)
     return {"results": [asdict(row) for row in scores], "averages": [asdict(row) for row in averages]}
 
 
-def print_tables(tables: Series[Table], console: Console | None = None) -> None:
+def print_tables(tables: list[Table], console: Console | None = None) -> None:
     """Print tables to the terminal, or to another console; None takes the standard output."""
     out = console or Console()
     if console is None and not out.is_terminal:
@@ -92,7 +91,7 @@ def print_tables(tables: Series[Table], console: Console | None = None) -> None:
         table.print(out)
 
 
-def report_tables(data: str, scores: Series[Score], seen: Seen = (), layout: TableLayout | None = None) -> list[Table]:
+def report_tables(data: str, scores: list[Score], seen: Seen = (), layout: TableLayout | None = None) -> list[Table]:
     """The experiment's table; the paper's kind of table, a column a sequence; then everything else, a row each.
 
     Without any ground truth the last alone. Arguments as for `write_report`, `data` being the name of the data group.
@@ -103,7 +102,7 @@ def report_tables(data: str, scores: Series[Score], seen: Seen = (), layout: Tab
     return tables if layout is None else [layout.table(scores, seen), *tables]
 
 
-def drift_table(data: str, scores: Series[Score], seen: Seen = ()) -> Table:
+def drift_table(data: str, scores: list[Score], seen: Seen = ()) -> Table:
     """Average translation error of each method on each sequence, both averages of several, published rows where due."""
     sequences = list(dict.fromkeys(row.sequence for row in scores))
     cells = {(row.method, row.sequence): _drift_cell(row, seen) for row in scores}
@@ -126,7 +125,7 @@ def drift_table(data: str, scores: Series[Score], seen: Seen = ()) -> Table:
     )
 
 
-def details_table(scores: Series[Score]) -> Table:
+def details_table(scores: list[Score]) -> Table:
     """Every other figure that is defined for any, one row for each method and sequence."""
     columns: dict[str, Callable[[Score], str]] = {
         "method": lambda row: row.method,
@@ -174,7 +173,7 @@ def _means(row: Averages, complete: int) -> tuple[str, str]:
     return _text(over_sequences, 3) + suffix, _text(over_segments, 3) + suffix
 
 
-def _reference_rows(data: str, scores: Series[Score], sequences: Series[str]) -> list[tuple[str, ...]]:
+def _reference_rows(data: str, scores: list[Score], sequences: list[str]) -> list[tuple[str, ...]]:
     """Published rows beside whole KITTI sequences; averages only over the very sequences that are averaged here."""
     whole = whole_kitti_sequences(data, scores)
     averaged = list(dict.fromkeys(row.sequence for row in scores if row.segments))
@@ -188,7 +187,7 @@ def _reference_rows(data: str, scores: Series[Score], sequences: Series[str]) ->
     return rows
 
 
-def _drift_notes(scores: Series[Score], rows: Series[tuple[str, ...]], has_reference: bool) -> list[str]:
+def _drift_notes(scores: list[Score], rows: list[tuple[str, ...]], has_reference: bool) -> list[str]:
     notes = ["Mean over segments of 100 to 800 m."]
     if len({row.sequence for row in scores}) > 1:
         notes[0] += (

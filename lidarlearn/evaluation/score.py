@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -164,7 +163,7 @@ def average_scores(scores: Iterable[Score]) -> list[Averages]:
     return [Averages(method, _over_sequences(rows), _over_segments(rows)) for method, rows in by_method.items()]
 
 
-def pool_by_length(scores: Series[Score]) -> dict[int, SegmentAverage]:
+def pool_by_length(scores: list[Score]) -> dict[int, SegmentAverage]:
     """Mean errors over the segments of each length [m], those of all sequences pooled."""
     pooled = {}
     for length in sorted({length for row in scores for length in row.by_segment_length}):
@@ -192,7 +191,7 @@ def _check(method: str, T_world_lidar: Tensor, sequence: Sequence) -> None:
         )
 
 
-def _over_sequences(rows: Series[Score]) -> MeanOverSequences:
+def _over_sequences(rows: list[Score]) -> MeanOverSequences:
     def mean(value: Callable[[Score], float | None]) -> float | None:
         defined = _defined(value(row) for row in rows)
         return sum(defined) / len(defined) if defined else None
@@ -212,7 +211,7 @@ def _over_sequences(rows: Series[Score]) -> MeanOverSequences:
     )
 
 
-def _over_segments(rows: Series[Score]) -> MeanOverSegments:
+def _over_segments(rows: list[Score]) -> MeanOverSegments:
     pooled = list(pool_by_length(rows).values())
     count = sum(part.segments for part in pooled)
     if not count:

@@ -1,7 +1,6 @@
 """A table as a paper sets it: groups of sequences as columns, one figure, published values below."""
 
 from collections.abc import Collection, Mapping
-from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 
 from lidarlearn.evaluation.score import MeanOverSequences, Score, average_scores
@@ -32,9 +31,9 @@ class TableLayout:
     """
 
     title: str
-    columns: Mapping[str, Series[str]]
+    columns: Mapping[str, Collection[str]]
     figure: str = "avg_translation_error_percent"
-    published: Mapping[str, Series[float | int | None]] = field(default_factory=dict)
+    published: Mapping[str, Collection[float | int | None]] = field(default_factory=dict)
     source: str = "published"
 
     def __post_init__(self) -> None:
@@ -44,7 +43,7 @@ class TableLayout:
             if len(values) != len(self.columns):
                 raise ValueError(f"table.published.{method}: {len(values)} values for {len(self.columns)} columns")
 
-    def table(self, scores: Series[Score], seen: Collection[tuple[str, str]] = ()) -> Table:
+    def table(self, scores: list[Score], seen: Collection[tuple[str, str]] = ()) -> Table:
         """The table of what was measured.
 
         Args:
@@ -71,8 +70,8 @@ class TableLayout:
     def _cell(
         self,
         method: str,
-        names: Series[str],
-        scores: Series[Score],
+        names: Collection[str],
+        scores: list[Score],
         seen: Collection[tuple[str, str]],
         digits: int,
     ) -> str:

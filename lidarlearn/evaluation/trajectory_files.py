@@ -1,7 +1,6 @@
 """Find and read trajectory files in KITTI's and TUM's format, and convert the frame that their poses are in."""
 
 from collections.abc import Iterator
-from collections.abc import Sequence as Series
 from pathlib import Path
 
 import torch
@@ -120,7 +119,7 @@ def to_reference_frame(
     return T_reference_lidar @ T_world_lidar @ torch.linalg.inv(T_reference_lidar)
 
 
-def find_trajectories(path: Path, sequences: Series[str]) -> dict[str, dict[str, Path]]:
+def find_trajectories(path: Path, sequences: list[str]) -> dict[str, dict[str, Path]]:
     """Trajectory files of any tool, by method and sequence.
 
     Args:
@@ -168,7 +167,7 @@ def _candidates(path: Path) -> Iterator[Path]:
     yield from sorted(p for p in path.iterdir() if p.is_dir())
 
 
-def _in_folder(folder: Path, sequences: Series[str]) -> dict[str, Path]:
+def _in_folder(folder: Path, sequences: list[str]) -> dict[str, Path]:
     """The file of each sequence that has one; .txt goes before .tum."""
     files = {}
     for name in sequences:
