@@ -1,6 +1,6 @@
-"""CUDA graphs: what a GPU is asked for again and again is recorded once, and from then on asked for at once.
+"""CUDA graphs: functions that are called again and again are captured once and replayed from then on.
 
-A scan takes a GPU a thousand small operations, and the CPU longer to ask for each than the GPU to do it.
+A scan takes about a thousand small operations on a GPU, and the CPU needs longer to launch each than the GPU to run it.
 """
 
 import contextlib
@@ -14,133 +14,58 @@ import torch
 from torch import Tensor
 
 
-def are_used_on(device: torch.device) -> bool:
-    """Whether there are any on a device. What is recorded asks for no size, and reads no number, of what it computes.
+def supported_on(device: torch.device) -> bool:
+    """Whether a device has CUDA graphs.
 
-    Where it depends on this how something is computed, it does so for this reason.
+    Captured code cannot wait for the GPU: it must read no value from it, and no size that depends on values. Code that
+    branches on this function avoids such reads in one branch.
     """
     return device.type == "cuda"
 
 
 @dataclass(frozen=True)
 class Padding:
-    """Rows behind those of a tensor: few different lengths need few recordings.
+    """Pads tensors with rows, so that many lengths share few graphs.
 
     Args:
-        value: what stands in them.
-        least: the length becomes a multiple of so many, or of more that are a quarter of it at most.
-        to_power_of_two: it becomes a power of two.
+        value: fills the added rows.
+        step: lengths are rounded up to a multiple of this, or of a quarter of the next power of two if that is more.
+        to_power_of_two: lengths are rounded up to a power of two instead.
     """
 
     value: float = torch.nan
-    least: int = 256
+    step: int = 256
     to_power_of_two: bool = False
 
     def length(self, rows: int) -> int:
-        """How many rows become of so many."""
+        """Number of rows with padding."""
         next_power = 1 << max(rows - 1, 1).bit_length()
-        return rows + -rows % (next_power if self.to_power_of_two else max(next_power // 4, self.least))
+        return rows + -rows % (next_power if self.to_power_of_two else max(next_power // 4, self.step))
 
     def write(self, rows: Tensor, into: Tensor) -> None:
-        """Rows, and the value behind them."""
+        """Copy rows into a longer tensor, and fill the rest with the value."""
         into[: len(rows)].copy_(rows)
         into[len(rows) :].fill_(self.value)
 
 
-class Recording:
-    """A function of tensors as a CUDA graph.
+class GraphCache:
+    """Calls functions of tensors; on a GPU, the second call captures a CUDA graph, which later calls replay.
 
-    Args:
-        function: whatever else than its arguments it reads must stay where it is in memory, and numbers of Python's
-            what they are.
-        inputs: arguments, on the device.
-        sent: places on the CPU, pinned, from where those arguments that have one come; None for others.
-        answer: a place on the CPU, pinned, for the result or the first of several; None where it stays.
-        device: where it computes.
-        pool: memory that it shares with others.
+    There is a graph for each combination of settings, device, shapes and dtypes. Functions that CUDA cannot capture
+    run eagerly, with a warning; so do all functions on devices without CUDA graphs.
 
-    Raises:
-        RuntimeError: CUDA does not record what the function does.
+    A result is valid until the next call of any function: graphs share memory.
     """
 
-    def __init__(
-        self,
-        function: Callable[..., Any],
-        inputs: Sequence[Tensor],
-        sent: Sequence[Tensor | None],
-        answer: Tensor | None,
-        device: torch.device,
-        pool: Any,
-    ) -> None:
-        def run() -> Any:
-            for place, value in zip(inputs, sent, strict=True):
-                if value is not None:
-                    place.copy_(value, non_blocking=True)
-            result = function(*inputs)
-            if answer is not None:
-                answer.copy_(_first(result), non_blocking=True)
-            return result
-
-        with torch.cuda.device(device):
-            self._graph, self._result = _captured(run, pool)
-            self._stream, self._done = torch.cuda.current_stream(), torch.cuda.Event()
-        self._is_read, self._is_sent = answer is not None, any(value is not None for value in sent)
-
-    def wait(self) -> None:
-        """Until what was sent for the last time has arrived."""
-        if self._is_sent and not self._is_read:
-            self._done.synchronize()
-
-    def replay(self) -> Any:
-        """The result of what stands in the inputs now, in the memory of the last one."""
-        self._graph.replay()
-        if self._is_read:
-            self._stream.synchronize()
-        elif self._is_sent:
-            self._done.record(self._stream)
-        return self._result
-
-
-def _captured(function: Callable[[], Any], pool: Any) -> tuple[torch.cuda.CUDAGraph, Any]:
-    """What `torch.cuda.graph` does, but it empties no caches: a scan may wait for that."""
-    graph, stream = torch.cuda.CUDAGraph(), _capture_stream(torch.cuda.current_device())
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-        try:
-            result = function()
-        except BaseException:
-            with contextlib.suppress(RuntimeError):  # which follows from the other
-                graph.capture_end()
-            raise
-        graph.capture_end()
-    torch.cuda.current_stream().wait_stream(stream)
-    return graph, result
-
-
-@functools.cache
-def _capture_stream(device: int) -> torch.cuda.Stream:
-    """One for all: libraries keep memory for every stream."""
-    return torch.cuda.Stream(device)
-
-
-class Recordings:
-    """Calls functions of tensors; on a GPU each is recorded when it comes the second time, and replayed from then on.
-
-    Where there are no CUDA graphs functions are simply called, and so are those of which CUDA does not make one.
-
-    A result is good until any of the functions is called again: the memory of the next one may be the same.
-    """
-
-    _MOST = 64  # more than an odometry needs; each keeps some megabytes
+    _MAX_GRAPHS = 64  # more than an odometry needs; each keeps a few megabytes
 
     def __init__(self) -> None:
-        self._recordings: dict[Hashable, _Prepared] = {}
+        self._calls: dict[Hashable, _StaticCall] = {}
         self._pool: Any = None
 
-    def forget(self) -> None:
-        """Give all memory back, because functions read from elsewhere now."""
-        self._recordings.clear()
+    def clear(self) -> None:
+        """Free all graphs, as when the memory that their functions read is replaced."""
+        self._calls.clear()
         self._pool = None
 
     def __call__(
@@ -153,42 +78,45 @@ class Recordings:
         keeps_first: bool = False,
         reads_first: bool = False,
     ) -> Any:
-        """The function's result.
+        """Call a function, or replay its graph.
 
         Args:
-            function: see `Recording`; one and the same in every call with equal settings.
+            function: reads only its inputs, tensors that stay at the same address, and constants; calls with equal
+                settings pass the same function.
             inputs: its arguments, on any device; the function gets them on `device`.
-            device: where it computes.
-            settings: tells this function from others, and from itself with other numbers.
-            padding: of the first argument, where functions are recorded.
-            keeps_first: whether the first argument, if it is the same tensor as in the last call, holds the same.
-            reads_first: whether the result, or the first of several, is wanted on the CPU.
+            device: where it runs.
+            settings: distinguishes functions, and their constants, from each other.
+            padding: of the first input, where functions are captured.
+            keeps_first: whether the first input is unchanged if it is the same tensor as in the last call.
+            reads_first: whether to return the result, or the first of several, on the CPU.
         """
-        if not are_used_on(device) or not all(value.numel() for value in inputs):
+        if not supported_on(device) or not all(value.numel() for value in inputs):
             result = function(*(value.to(device) for value in inputs))
-            return _read(result) if reads_first else result
+            return _with_first_on_cpu(result) if reads_first else result
         shapes = [tuple(value.shape) for value in inputs]
         if padding is not None:
             shapes[0] = (padding.length(len(inputs[0])), *shapes[0][1:])
         key = (settings, device, *shapes, *(value.dtype for value in inputs))
-        if key not in self._recordings:
-            if len(self._recordings) >= self._MOST:
-                self.forget()
+        if key not in self._calls:
+            if len(self._calls) >= self._MAX_GRAPHS:
+                self.clear()
             self._pool = self._pool or _pool()
-            self._recordings[key] = _Prepared(inputs, shapes, device, self._pool, padding, reads_first)
-        return self._recordings[key](function, inputs, keeps_first)
+            self._calls[key] = _StaticCall(inputs, shapes, device, self._pool, padding, reads_first)
+        return self._calls[key](function, inputs, keeps_first)
 
 
-class _Prepared:
-    """A function and places for its arguments and its answer: called once as it is, and then recorded.
+class _StaticCall:
+    """A function with static inputs: its first call is eager, the second captures it, later ones replay it.
+
+    Inputs from the CPU, and a result for the CPU, pass through pinned memory; the graph contains these copies.
 
     Args:
-        inputs: the first arguments.
-        shapes: of the places.
-        device: where the function computes.
-        pool: see `Recording`.
-        padding: of the first argument.
-        reads_first: see `Recordings`.
+        inputs: the arguments of the first call.
+        shapes: shapes of the static inputs, with padding.
+        device: where the function runs.
+        pool: memory that graphs share.
+        padding: of the first input.
+        reads_first: see `GraphCache.__call__`.
     """
 
     def __init__(
@@ -202,56 +130,116 @@ class _Prepared:
     ) -> None:
         both = list(zip(inputs, shapes, strict=True))
         self._inputs = [torch.empty(shape, dtype=value.dtype, device=device) for value, shape in both]
-        self._sent = [_pinned(shape, value.dtype) if value.device.type == "cpu" else None for value, shape in both]
+        self._pinned = [_pinned(shape, value.dtype) if value.device.type == "cpu" else None for value, shape in both]
         self._device, self._pool, self._padding, self._reads_first = device, pool, padding, reads_first
-        self._answer: Tensor | None = None
-        self._first: Tensor | None = None
-        self._has_come = self._is_refused = False
-        self._recording: Recording | None = None
+        self._pinned_result: Tensor | None = None
+        self._last_first: Tensor | None = None
+        self._eager_calls = 0
+        self._captured: CapturedGraph | None = None
 
     def __call__(self, function: Callable[..., Any], inputs: Sequence[Tensor], keeps_first: bool) -> Any:
-        """The result for these arguments."""
-        if self._recording is not None:
-            self._recording.wait()
-        for i, given in enumerate(inputs):
-            if i or not (keeps_first and given is self._first):
-                self._write(i, given)
-        if self._has_come and self._recording is None and not self._is_refused:
-            self._record(function)
-        if self._recording is None:
-            return self._call(function)
-        result = self._recording.replay()
-        return result if self._answer is None else _replaced(result, self._answer)
+        """The function's result."""
+        if self._captured is not None:
+            self._captured.done.synchronize()  # it may still read pinned inputs; returns at once if not recorded
+        for i, value in enumerate(inputs):
+            if i or not (keeps_first and value is self._last_first):
+                self._write(i, value)
+        if self._captured is None and self._eager_calls == 1:
+            self._capture(function)
+        return self._call(function) if self._captured is None else self._replay(self._captured)
 
-    def _record(self, function: Callable[..., Any]) -> None:
-        try:
-            self._recording = Recording(function, self._inputs, self._sent, self._answer, self._device, self._pool)
-        except RuntimeError as error:
-            self._is_refused = True
-            reason = str(error).partition("\n")[0]
-            warnings.warn(f"{function} is slower than it could be, it cannot be a CUDA graph: {reason}", stacklevel=4)
+    def _write(self, i: int, value: Tensor) -> None:
+        """Copy an input to its static or pinned memory."""
+        pinned = self._pinned[i]
+        memory = self._inputs[i] if pinned is None else pinned
+        if i == 0:
+            self._last_first = value
+        if i == 0 and self._padding is not None:
+            self._padding.write(value, into=memory)
+        else:
+            memory.copy_(value)
+
+    def _copy_pinned_inputs(self, non_blocking: bool) -> None:
+        for static, pinned in zip(self._inputs, self._pinned, strict=True):
+            if pinned is not None:
+                static.copy_(pinned, non_blocking=non_blocking)
 
     def _call(self, function: Callable[..., Any]) -> Any:
-        for place, value in zip(self._inputs, self._sent, strict=True):
-            if value is not None:
-                place.copy_(value)
+        self._copy_pinned_inputs(non_blocking=False)
         result = function(*self._inputs)
-        self._has_come = True
+        self._eager_calls += 1
         if not self._reads_first:
             return result
-        self._answer = _pinned(_first(result).shape, _first(result).dtype)
-        return _read(result)
+        self._pinned_result = _pinned(_first(result).shape, _first(result).dtype)
+        return _with_first_on_cpu(result)
 
-    def _write(self, i: int, given: Tensor) -> None:
-        """Into the place of an argument."""
-        sent = self._sent[i]
-        place = self._inputs[i] if sent is None else sent
-        if i == 0:
-            self._first = given
-        if i == 0 and self._padding is not None:
-            self._padding.write(given, into=place)
-        else:
-            place.copy_(given)
+    def _capture(self, function: Callable[..., Any]) -> None:
+        def copy_and_call() -> Any:
+            self._copy_pinned_inputs(non_blocking=True)
+            result = function(*self._inputs)
+            if self._pinned_result is not None:
+                self._pinned_result.copy_(_first(result), non_blocking=True)
+            return result
+
+        try:
+            self._captured = capture(copy_and_call, self._device, self._pool)
+        except RuntimeError as error:
+            reason = str(error).partition("\n")[0]
+            warnings.warn(f"slower than necessary: {function} cannot be a CUDA graph: {reason}", stacklevel=4)
+
+    def _replay(self, captured: "CapturedGraph") -> Any:
+        captured.graph.replay()
+        if self._pinned_result is not None:
+            captured.stream.synchronize()
+            return _with_first(captured.result, self._pinned_result)
+        if any(pinned is not None for pinned in self._pinned):
+            captured.done.record(captured.stream)
+        return captured.result
+
+
+@dataclass(frozen=True)
+class CapturedGraph:
+    """A CUDA graph of a function without arguments.
+
+    Args:
+        graph: the graph.
+        result: the function's result, in memory that each replay overwrites.
+        stream: the stream of replays.
+        done: event for the end of a replay, not recorded yet.
+    """
+
+    graph: torch.cuda.CUDAGraph
+    result: Any
+    stream: torch.cuda.Stream
+    done: torch.cuda.Event
+
+
+def capture(function: Callable[[], Any], device: torch.device, pool: Any) -> CapturedGraph:
+    """Capture a function as `torch.cuda.graph` does, but without emptying caches, as a scan may be waiting.
+
+    Raises:
+        RuntimeError: CUDA cannot capture one of the function's operations.
+    """
+    with torch.cuda.device(device):
+        graph, stream = torch.cuda.CUDAGraph(), _capture_stream(torch.cuda.current_device())
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+            try:
+                result = function()
+            except BaseException:
+                with contextlib.suppress(RuntimeError):  # a consequence of the first error
+                    graph.capture_end()
+                raise
+            graph.capture_end()
+        torch.cuda.current_stream().wait_stream(stream)
+        return CapturedGraph(graph, result, torch.cuda.current_stream(), torch.cuda.Event())
+
+
+@functools.cache
+def _capture_stream(device: int) -> torch.cuda.Stream:
+    """One stream for all captures: libraries keep memory for every stream."""
+    return torch.cuda.Stream(device)
 
 
 def _pool() -> Any:
@@ -266,9 +254,9 @@ def _first(result: Any) -> Tensor:
     return result[0] if isinstance(result, tuple) else result
 
 
-def _replaced(result: Any, first: Tensor) -> Any:
+def _with_first(result: Any, first: Tensor) -> Any:
     return (first, *result[1:]) if isinstance(result, tuple) else first
 
 
-def _read(result: Any) -> Any:
-    return _replaced(result, _first(result).cpu())
+def _with_first_on_cpu(result: Any) -> Any:
+    return _with_first(result, _first(result).cpu())

@@ -1,99 +1,99 @@
-"""Recorded functions, on a pretended recorder; see `pretended_graphs` for what that shows."""
+"""The graph cache, with fake CUDA graphs; see `fake_cuda_graphs` for what they show."""
 
 import pytest
 import torch
 from torch import Tensor
 
-from lidarlearn.cuda_graphs import Padding, Recordings
+from lidarlearn.cuda_graphs import GraphCache, Padding
 from lidarlearn.geometry.voxels import grid_sample
-from tests import pretended_graphs
+from tests import fake_cuda_graphs
 
 CPU = torch.device("cpu")
 
 
-def test_functions_are_simply_called_where_there_are_no_graphs():
-    recordings, called = Recordings(), []
+def test_functions_run_eagerly_where_there_are_no_graphs():
+    graphs, called = GraphCache(), []
 
     def count(values: Tensor) -> Tensor:
         called.append(len(values))
         return values.sum()
 
     for length in (3, 3, 3):
-        assert recordings(count, torch.ones(length), device=CPU, padding=Padding()) == length
+        assert graphs(count, torch.ones(length), device=CPU, padding=Padding()) == length
     assert called == [3, 3, 3]
 
 
-def test_a_function_is_called_once_recorded_once_and_then_replayed(monkeypatch):
-    made, recordings, called = pretended_graphs.pretend(monkeypatch), Recordings(), []
+def test_a_function_is_called_once_captured_once_and_then_replayed(monkeypatch):
+    captured, graphs, called = fake_cuda_graphs.install(monkeypatch), GraphCache(), []
 
     def double(values: Tensor) -> Tensor:
         called.append(True)
         return 2 * values
 
     for i in range(5):
-        assert torch.equal(recordings(double, torch.full((4,), float(i)), device=CPU), torch.full((4,), 2.0 * i))
-    assert len(called) == 2 and len(made) == 1
-    recordings(double, torch.ones(5), device=CPU)
-    recordings(double, torch.ones(4), device=CPU, settings="others")
-    recordings(double, torch.ones(4, dtype=torch.float64), device=CPU)
+        assert torch.equal(graphs(double, torch.full((4,), float(i)), device=CPU), torch.full((4,), 2.0 * i))
+    assert len(called) == 2 and len(captured) == 1
+    graphs(double, torch.ones(5), device=CPU)
+    graphs(double, torch.ones(4), device=CPU, settings="others")
+    graphs(double, torch.ones(4, dtype=torch.float64), device=CPU)
     assert len(called) == 5
-    recordings.forget()
-    recordings(double, torch.ones(4), device=CPU)
-    assert len(called) == 6 and len(made) == 1
+    graphs.clear()
+    graphs(double, torch.ones(4), device=CPU)
+    assert len(called) == 6 and len(captured) == 1
 
 
-def test_rows_of_other_lengths_share_a_recording(monkeypatch):
-    made, recordings = pretended_graphs.pretend(monkeypatch), Recordings()
+def test_rows_of_other_lengths_share_a_graph(monkeypatch):
+    captured, graphs = fake_cuda_graphs.install(monkeypatch), GraphCache()
 
     def numbers(rows: Tensor) -> Tensor:
         return rows.isfinite().sum()
 
     for length in (700, 650, 760, 700):
-        assert recordings(numbers, torch.ones(length, 1), device=CPU, padding=Padding()) == length
-    assert len(made) == 1
+        assert graphs(numbers, torch.ones(length, 1), device=CPU, padding=Padding()) == length
+    assert len(captured) == 1
 
 
 def test_a_first_argument_that_is_kept_is_not_copied_again(monkeypatch):
-    pretended_graphs.pretend(monkeypatch)
-    recordings, kept, other = Recordings(), torch.ones(3), torch.full((3,), 5.0)
+    fake_cuda_graphs.install(monkeypatch)
+    graphs, kept, other = GraphCache(), torch.ones(3), torch.full((3,), 5.0)
 
     def total(values: Tensor, factor: Tensor) -> Tensor:
         return values.sum() * factor
 
     def call(values: Tensor, factor: float) -> float:
-        return float(recordings(total, values, torch.tensor(factor), device=CPU, keeps_first=True, reads_first=True))
+        return float(graphs(total, values, torch.tensor(factor), device=CPU, keeps_first=True, reads_first=True))
 
     assert [call(kept, 1.0), call(kept, 2.0), call(other, 2.0), call(kept, 3.0)] == [3.0, 6.0, 30.0, 9.0]
 
 
-def test_nothing_is_recorded_of_nothing(monkeypatch):
-    made, recordings = pretended_graphs.pretend(monkeypatch), Recordings()
+def test_empty_inputs_are_not_captured(monkeypatch):
+    captured, graphs = fake_cuda_graphs.install(monkeypatch), GraphCache()
     for _ in range(3):
-        assert len(recordings(lambda values: values + 1, torch.zeros(0, 3), device=CPU, padding=Padding())) == 0
-    assert not made
+        assert len(graphs(lambda values: values + 1, torch.zeros(0, 3), device=CPU, padding=Padding())) == 0
+    assert not captured
 
 
-def test_what_cannot_be_recorded_is_called_and_told_once(monkeypatch):
-    """Such as a robust weight of one's own that asks for a number."""
-    pretended_graphs.pretend(monkeypatch)
-    recordings, seen = Recordings(), torch.zeros(3)
+def test_what_cannot_be_captured_runs_eagerly_with_one_warning(monkeypatch):
+    """Such as a custom robust weight that reads a value from the GPU."""
+    fake_cuda_graphs.install(monkeypatch)
+    graphs, seen = GraphCache(), torch.zeros(3)
 
     def positive(values: Tensor) -> Tensor:
         seen.add_(values)
         return values[values > 0]
 
     def call() -> Tensor:
-        return recordings(positive, torch.tensor([1.0, -1.0, 2.0]), device=CPU, reads_first=True)
+        return graphs(positive, torch.tensor([1.0, -1.0, 2.0]), device=CPU, reads_first=True)
 
     assert call().tolist() == [1.0, 2.0]
-    with pytest.warns(UserWarning, match="cannot be a CUDA graph: .* the GPU would have to answer"):
+    with pytest.warns(UserWarning, match="cannot be a CUDA graph: .* the CPU would have to wait"):
         assert call().tolist() == [1.0, 2.0]
     assert call().tolist() == [1.0, 2.0]
     assert seen.tolist() == [3.0, -3.0, 6.0]
 
 
-@pytest.mark.parametrize("padding", [Padding(), Padding(least=4096), Padding(to_power_of_two=True)])
-def test_paddings_make_few_lengths_of_many(padding):
+@pytest.mark.parametrize("padding", [Padding(), Padding(step=4096), Padding(to_power_of_two=True)])
+def test_padding_makes_few_lengths_of_many(padding):
     lengths = {padding.length(rows) for rows in range(1, 200_000, 7)}
     assert len(lengths) <= 60
     assert all(rows <= padding.length(rows) for rows in range(1, 10_000))
@@ -101,11 +101,11 @@ def test_paddings_make_few_lengths_of_many(padding):
         assert all(padding.length(rows) <= 1.5 * rows for rows in range(2000, 200_000, 11))
 
 
-def test_a_grid_is_sampled_the_same(monkeypatch):
+def test_a_captured_grid_sampling_is_the_same(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     scans = [50 * torch.rand(n, 3, generator=generator) - 25 for n in (1000, 1000, 900, 1024, 1, 0)]
     here = [grid_sample(points, 0.7) for points in scans]
-    made, recordings = pretended_graphs.pretend(monkeypatch), Recordings()
+    captured, graphs = fake_cuda_graphs.install(monkeypatch), GraphCache()
     for points, index in zip(scans, here, strict=True):
-        assert torch.equal(grid_sample(points, 0.7, recordings), index)
-    assert len(made) == 1
+        assert torch.equal(grid_sample(points, 0.7, graphs), index)
+    assert len(captured) == 1

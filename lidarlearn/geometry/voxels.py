@@ -31,7 +31,7 @@ def voxel_keys(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
 
 
 def grid_sample(
-    points: Float[Tensor, "n 3"], voxel_size_m: float, recordings: cuda_graphs.Recordings | None = None
+    points: Float[Tensor, "n 3"], voxel_size_m: float, graphs: cuda_graphs.GraphCache | None = None
 ) -> Int[Tensor, "m"]:
     """Index of one random point per occupied voxel, sorted by voxel.
 
@@ -42,25 +42,25 @@ def grid_sample(
     Args:
         points: the scan [m].
         voxel_size_m: edge of the voxels [m].
-        recordings: where to record this on a GPU, for callers that sample scan after scan.
+        graphs: keeps the CUDA graphs, for callers that sample scan after scan.
 
     Source: Dellenbach et al. 2021, IV-A: 0.4 m for Kd-F2M.
     """
-    if recordings is not None and cuda_graphs.are_used_on(points.device):
-        return _recorded_grid_sample(points, voxel_size_m, recordings)
+    if graphs is not None and cuda_graphs.supported_on(points.device):
+        return _grid_sample_in_graph(points, voxel_size_m, graphs)
     permutation = _permutation(len(points), points.device)
     _, order, is_first = _sorted(voxel_keys(voxel_cells(points, voxel_size_m)).index_select(0, permutation))
     return permutation[order[is_first]]
 
 
-def _recorded_grid_sample(
-    points: Float[Tensor, "n 3"], voxel_size_m: float, recordings: cuda_graphs.Recordings
+def _grid_sample_in_graph(
+    points: Float[Tensor, "n 3"], voxel_size_m: float, graphs: cuda_graphs.GraphCache
 ) -> Int[Tensor, "m"]:
-    """The same with a single read of a size."""
+    """The same, waiting for the GPU only once."""
     padding = cuda_graphs.Padding(to_power_of_two=True)  # as long as the permutations
     sample = functools.partial(_sample, voxel_size_m=voxel_size_m)
     settings = ("grid_sample", voxel_size_m)
-    index, is_first = recordings(sample, points, device=points.device, settings=settings, padding=padding)
+    index, is_first = graphs(sample, points, device=points.device, settings=settings, padding=padding)
     return index[is_first]
 
 

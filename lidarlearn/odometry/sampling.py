@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarlearn.cuda_graphs import Padding, Recordings
+from lidarlearn.cuda_graphs import GraphCache, Padding
 from lidarlearn.errors import require_positive
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
@@ -95,7 +95,7 @@ class GridSampling(Sampling):
 
     map_voxel_m: float = 0.4
     query_voxel_m: float | None = None
-    _recordings: Recordings = field(default_factory=Recordings, init=False, repr=False, compare=False)
+    _graphs: GraphCache = field(default_factory=GraphCache, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         require_positive("sampling", map_voxel_m=self.map_voxel_m)
@@ -107,10 +107,10 @@ class GridSampling(Sampling):
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
         """One point of every voxel, drawn by `grid_sample`, in the order of the voxels."""
-        index = grid_sample(points, self.map_voxel_m, self._recordings)
+        index = grid_sample(points, self.map_voxel_m, self._graphs)
         points = points[index]
         if self.query_voxel_m is not None and self.query_voxel_m > self.map_voxel_m:
-            queries = grid_sample(points, self.query_voxel_m, self._recordings).sort().values
+            queries = grid_sample(points, self.query_voxel_m, self._graphs).sort().values
         else:
             queries = torch.arange(len(points), device=points.device)
         return SampledScan(points, None if times is None else times[index], queries)
@@ -129,7 +129,7 @@ class ImageSampling(Sampling):
 
     projection: SphericalProjection
     max_queries: int = 8000
-    _recordings: Recordings = field(default_factory=Recordings, init=False, repr=False, compare=False)
+    _graphs: GraphCache = field(default_factory=GraphCache, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         require_positive("sampling", max_queries=self.max_queries)
@@ -137,7 +137,7 @@ class ImageSampling(Sampling):
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
         """The nearest points, and an evenly strided subset of them, scattered over rows and columns."""
         nearest_points = self.projection.nearest_points
-        index = self._recordings(nearest_points, points, device=points.device, padding=_PADDING).flatten()
+        index = self._graphs(nearest_points, points, device=points.device, padding=_PADDING).flatten()
         index = index[index >= 0]
         count = min(self.max_queries, len(index))
         chosen = torch.linspace(0, max(len(index) - 1, 0), count, dtype=torch.float64, device=points.device)

@@ -107,9 +107,9 @@ class GaussNewton:
         T = T_world_lidar.cpu().numpy()
         converged = np.zeros(T.shape[:-2], dtype=bool)
         matching, queries = self._matching(association), Queries(points, normals)
-        # A recorded function with fewer points would be another recording, and no faster.
-        is_recorded = matching.recordings(queries) is not None
-        coarse = queries if is_recorded else queries.every(self.coarse_stride)
+        # A CUDA graph of fewer points would be an additional one, and no faster.
+        is_captured = matching.graphs(queries) is not None
+        coarse = queries if is_captured else queries.every(self.coarse_stride)
         iterations, neighbours = 0, None
         for distance_m in self._distances_m(search_distance_m):
             iterations += 1
@@ -189,7 +189,7 @@ class GaussNewton:
         weakest = np.take_along_axis(directions, order[..., None, :], axis=-1)[..., 0]
         terms = equations.terms
         count = functools.partial(self._counts, terms)
-        counts = terms.recordings(count, device=terms.mask.device, settings=self, reads_first=True)
+        counts = terms.graphs(count, device=terms.mask.device, settings=self, reads_first=True)
         neighbours, inliers, fit, weight = counts.numpy()
         points = max(equations.points, 1)
         return RegistrationResult(

@@ -68,14 +68,14 @@ class Matching:
             distance_m: search distance [m].
             last: neighbours of the last call with the same queries, see `Association.search`.
         """
-        points, recordings = queries.points, self.recordings(queries)
-        if recordings is None:
+        points, graphs = queries.points, self.graphs(queries)
+        if graphs is None:
             T = torch.from_numpy(T_world_lidar).to(points)
             hessian, terms = self._terms(points, T, distance_m, distance_m, queries.normals, last)
             return NormalEquations.of(hessian.cpu(), terms, len(points))
         reach_m = self.association.reach_m(distance_m)
-        hessian, terms = recordings(
-            functools.partial(self._recorded_terms, shape=T_world_lidar.shape, reach_m=reach_m),
+        hessian, terms = graphs(
+            functools.partial(self._terms_in_graph, shape=T_world_lidar.shape, reach_m=reach_m),
             points,
             torch.from_numpy(np.append(T_world_lidar, distance_m)),  # one transfer
             device=points.device,
@@ -86,12 +86,12 @@ class Matching:
         )
         return NormalEquations.of(hessian, terms, len(points))
 
-    def recordings(self, queries: Queries) -> cuda_graphs.Recordings | None:
-        """Where the computation is recorded; None if it is not, as for generalized ICP, which inverts matrices."""
-        is_recorded = cuda_graphs.are_used_on(queries.points.device) and queries.normals is None
-        return self.association.recordings if is_recorded else None
+    def graphs(self, queries: Queries) -> cuda_graphs.GraphCache | None:
+        """CUDA graphs of the terms; None if they are not captured, as in generalized ICP, which inverts matrices."""
+        is_captured = cuda_graphs.supported_on(queries.points.device) and queries.normals is None
+        return self.association.graphs if is_captured else None
 
-    def _recorded_terms(
+    def _terms_in_graph(
         self, points: Float[Tensor, "n 3"], numbers: Float[Tensor, "_"], shape: tuple[int, ...], reach_m: float
     ) -> _HessianAndTerms:
         numbers = numbers.to(points)

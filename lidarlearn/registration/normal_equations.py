@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lidarlearn.cuda_graphs import Recordings
+from lidarlearn.cuda_graphs import GraphCache
 from lidarlearn.registration.association.base import Neighbours
 
 # A residual is sensitive to a move of 1 m if it changes by more than this [m]: the sine of 17 deg, more than the error
@@ -32,7 +32,7 @@ class Terms:
         surface_distances_m: distance of each point from the map's surface at its neighbour [m].
         weights: robust weight of each point, 0 outside the mask.
         augmented_jacobians: [J r] of each point, see `Residual.linearize`.
-        recordings: of functions of these.
+        graphs: CUDA graphs of functions of these terms.
     """
 
     neighbours: Neighbours | None
@@ -40,12 +40,12 @@ class Terms:
     surface_distances_m: Float[Tensor, "*batch m"]
     weights: Float[Tensor, "*batch m"]
     augmented_jacobians: Float[Tensor, "*batch m k 7"]
-    recordings: Recordings = field(default_factory=Recordings)
+    graphs: GraphCache = field(default_factory=GraphCache)
 
     def sensitive_points(self, pose_directions: Float64[np.ndarray, "*batch 6 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Weighted number of points whose residual changes noticeably under each of three moves of the pose."""
         moves, device = torch.from_numpy(pose_directions), self.weights.device
-        return self.recordings(self._sensitive_points, moves, device=device, reads_first=True).numpy()
+        return self.graphs(self._sensitive_points, moves, device=device, reads_first=True).numpy()
 
     def _sensitive_points(self, moves: Float[Tensor, "*batch 6 3"]) -> Float[Tensor, "*batch 3"]:
         jacobians = self.augmented_jacobians[..., :6]
@@ -56,7 +56,7 @@ class Terms:
     def phase_moments(self, phases: Float[Tensor, "n"]) -> Float64[np.ndarray, "2 *batch 7 7"]:
         """Augmented Hessians in which each point is also weighted by its phase, and by the square of its phase."""
         phases = pad(phases, (0, self.weights.shape[-1] - len(phases)))
-        return self.recordings(self._phase_moments, phases, device=self.weights.device, reads_first=True).numpy().copy()
+        return self.graphs(self._phase_moments, phases, device=self.weights.device, reads_first=True).numpy().copy()
 
     def _phase_moments(self, phases: Float[Tensor, "m"]) -> Float64[Tensor, "2 *batch 7 7"]:
         jacobians, weights = self.augmented_jacobians.double(), self.weights * phases

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lidarlearn.cuda_graphs import Recordings
+from lidarlearn.cuda_graphs import GraphCache
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.training.checkpoints import CheckpointError, load_checkpoint
@@ -29,16 +29,16 @@ class TrainedNetwork:
     network: nn.Module
     projection: SphericalProjection
     device: torch.device
-    _recordings: Recordings = field(default_factory=Recordings, init=False, repr=False, compare=False)
+    _graphs: GraphCache = field(default_factory=GraphCache, init=False, repr=False, compare=False)
 
     @torch.no_grad()
     def relative_pose(
         self, reference: Float[Tensor, "batch 3 h w"], target: Float[Tensor, "batch 3 h w"]
     ) -> Float[Tensor, "batch 4 4"]:
         """`T_ref_new`, float64, from two vertex maps [m] made with `projection`."""
-        if len(reference) > 1:  # enough for a GPU to do while it is asked for more
+        if len(reference) > 1:  # enough work for a GPU to hide the launches of its kernels
             return self._relative_pose(reference, target)
-        return self._recordings(self._relative_pose, reference, target, device=self.device).clone()
+        return self._graphs(self._relative_pose, reference, target, device=self.device).clone()
 
     def _relative_pose(self, reference: Tensor, target: Tensor) -> Float[Tensor, "batch 4 4"]:
         return se3.from_euler(self.network(reference, target).double())

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from lidarlearn.cuda_graphs import Recordings
+from lidarlearn.cuda_graphs import GraphCache
 from lidarlearn.geometry.voxels import VoxelSums, grid_sample, voxel_cells, voxel_keys
 from tests.gpu import on_gpu
 
@@ -86,10 +86,10 @@ def test_sums_over_nothing_are_empty():
 
 @on_gpu
 def test_a_gpu_samples_the_same_points():
-    """The first time by calling, the second by recording, then by replaying."""
-    recordings = Recordings()
+    """The first call is eager, the second is captured, the third replayed."""
+    graphs = GraphCache()
     for seed in range(4):
         points = 50 * torch.rand(3000 + seed, 3, generator=torch.Generator().manual_seed(seed)) - 25
         index = grid_sample(points, 0.8)
-        assert torch.equal(grid_sample(points.cuda(), 0.8, recordings).cpu(), index)
+        assert torch.equal(grid_sample(points.cuda(), 0.8, graphs).cpu(), index)
         assert torch.equal(grid_sample(points.cuda(), 0.8).cpu(), index)

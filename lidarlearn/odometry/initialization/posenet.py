@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.cuda_graphs import Padding, Recordings
+from lidarlearn.cuda_graphs import GraphCache, Padding
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.odometry.initialization.base import Initialization, InitialMotion
@@ -43,12 +43,12 @@ class PoseNetInitialization(Initialization):
     def __init__(self, network: RelativePoseNetwork) -> None:
         self._network = network
         self._previous: Tensor | None = None
-        self._recordings = Recordings()
+        self._graphs = GraphCache()
 
     def predict(self, points: Float[Tensor, "n 3"], last_motion: Float[Tensor, "4 4"]) -> InitialMotion:
         """The network's estimate; the identity for the first scan; constant velocity where it is not finite."""
         project, device = self._network.projection.vertex_map, self._network.device
-        vertices = self._recordings(project, points, device=device, padding=_PADDING)[None].clone()
+        vertices = self._graphs(project, points, device=device, padding=_PADDING)[None].clone()
         previous, self._previous = self._previous, vertices
         if previous is None:
             return InitialMotion(se3.identity(), "posenet")

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarlearn import cuda_graphs
-from lidarlearn.cuda_graphs import Recordings
+from lidarlearn.cuda_graphs import GraphCache
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,14 @@ class Association(ABC):
         return self.normals[index]
 
     @property
-    def recordings(self) -> Recordings | None:
-        """Recordings of functions that search this map; None if a search leaves the map's device."""
+    def graphs(self) -> GraphCache | None:
+        """CUDA graphs of functions that search this map; None if a search needs the CPU."""
         return None
 
     def reach_m(self, max_distance_m: float) -> float:
-        """The search distance rounded up to one of a few values, at little extra work [m].
+        """The search distance [m], rounded up to one of a few values where that costs little.
 
-        A recording has a fixed search distance: this bounds their number.
+        A CUDA graph has a fixed search distance, so few values need few graphs.
         """
         return max_distance_m
 
@@ -125,8 +125,8 @@ class Association(ABC):
             nothing = torch.zeros_like(points_world)
             return Correspondences(nothing, nothing, torch.zeros_like(points_world[:, 0], dtype=torch.bool))
         bins = self.bins(points_world)
-        is_recorded = self.recordings is not None and cuda_graphs.are_used_on(points_world.device)
-        if last is None or len(last.index) != len(points_world) or is_recorded:
+        is_captured = self.graphs is not None and cuda_graphs.supported_on(points_world.device)
+        if last is None or len(last.index) != len(points_world) or is_captured:
             neighbours = self.nearest(points_world, bins, max_distance_m)
         else:
             neighbours = self._followed(points_world, bins, max_distance_m, last)

@@ -5,23 +5,22 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarlearn import cuda_graphs
+from lidarlearn.cuda_graphs import GraphCache
 
 _INITIAL_CAPACITY = 1 << 16  # points
-_INITIAL_CAPACITY_ON_GPU = (
-    1 << 21
-)  # as many as 30 scans need: where buffers move, all that was recorded is recorded again
+_INITIAL_CAPACITY_ON_GPU = 1 << 21  # enough for 30 scans: when buffers grow, all graphs are captured again
 
 
 class PointBuffer:
     """Points and normals of the last scans in one growing buffer, oldest first.
 
-    Adding appends, forgetting advances the start; when the buffer is full, what is left moves to its front. Each axis
-    is contiguous in memory, as projections and distances are computed axis by axis.
+    Adding a scan appends it, forgetting one advances the start; when the buffer is full, the remaining points move to
+    its front. Each axis is contiguous in memory, as projections and distances are computed axis by axis.
 
     Attributes:
-        slot_coordinates: coordinates (3, capacity) by slot, those of forgotten points and of free slots included.
-        origin: the slot of the first point, a number on the device.
-        recordings: of functions that read this memory; forgotten when it is replaced.
+        slot_coordinates: coordinates [m] of all slots (3, capacity), including forgotten points and free slots.
+        origin: slot of the first point, as a tensor on the device.
+        graphs: CUDA graphs of functions that read this memory, cleared when it is replaced.
 
     Args:
         device: where the points are kept.
@@ -33,8 +32,8 @@ class PointBuffer:
         self._lengths: list[int] = []
         self._forgotten = 0
         self.origin = torch.zeros((), dtype=torch.int32, device=device)
-        self.recordings = cuda_graphs.Recordings()
-        self._reserve(_INITIAL_CAPACITY_ON_GPU if cuda_graphs.are_used_on(device) else _INITIAL_CAPACITY)
+        self.graphs = GraphCache()
+        self._reserve(_INITIAL_CAPACITY_ON_GPU if cuda_graphs.supported_on(device) else _INITIAL_CAPACITY)
 
     @property
     def points(self) -> Float[Tensor, "n 3"]:
@@ -61,7 +60,7 @@ class PointBuffer:
 
     @property
     def end(self) -> int:
-        """The slot behind the last point."""
+        """The slot after the last point."""
         return self._end
 
     def __len__(self) -> int:
@@ -69,7 +68,7 @@ class PointBuffer:
         return len(self._lengths)
 
     def append(self, coordinates: Float[Tensor, "3 m"], normals: Float[Tensor, "m 3"]) -> int:
-        """Append a scan; returns by how many slots all others moved to the front."""
+        """Append a scan; returns by how many slots the other points moved towards the front."""
         new, moved = self._allocate(coordinates.shape[1])
         self.slot_coordinates[:, new] = coordinates
         self._normals[new] = normals
@@ -82,12 +81,12 @@ class PointBuffer:
         return self._scans[self._start : self._end] - self.oldest_scan
 
     def at(self, slots: Int[Tensor, "m"]) -> tuple[Float[Tensor, "3 m"], Int[Tensor, "m"]]:
-        """Coordinates of the points in some slots, and the number of each one's scan."""
+        """Coordinates of the points in some slots, and the number of the scan of each."""
         return self.slot_coordinates[:, slots], self._scans[slots]
 
     @property
     def oldest_scan(self) -> int:
-        """Number of the oldest scan that is left; the first one ever added has number 0."""
+        """Number of the oldest scan in the buffer; the first scan ever added is number 0."""
         return self._forgotten
 
     def forget(self, scans: int) -> None:
@@ -102,11 +101,11 @@ class PointBuffer:
         return len(self._normals)
 
     def _allocate(self, count: int, spare: int = 0) -> tuple[slice, int]:
-        """The slots for a new scan, and by how many slots the others moved to the front to make room.
+        """The slots for a new scan, and by how many slots the other points moved to make room.
 
         Args:
             count: number of its points.
-            spare: number of further slots that must exist behind them.
+            spare: number of free slots to leave behind them.
         """
         moved = 0
         if self._end + count + spare > self._capacity:
@@ -118,7 +117,7 @@ class PointBuffer:
         return new, moved
 
     def _move_to_front(self, needed: int) -> None:
-        """Move all points to the front, of larger buffers if these would soon be full again."""
+        """Move all points to the front; the buffers grow if they would otherwise soon be full again."""
         count = self._end - self._start
         living = [rows[self._start : self._end].clone() for rows in self._buffers()]
         if 2 * (count + needed) > self._capacity:
@@ -129,11 +128,11 @@ class PointBuffer:
         self.origin.zero_()
 
     def _buffers(self) -> tuple[Tensor, ...]:
-        """All buffers, one row a slot."""
+        """All buffers, one row per slot."""
         return self.slot_coordinates.mT, self._normals, self._scans
 
     def _reserve(self, capacity: int) -> None:
         self.slot_coordinates = torch.empty(3, capacity, device=self._device)
         self._normals = torch.empty(capacity, 3, device=self._device)
         self._scans = torch.empty(capacity, dtype=torch.int32, device=self._device)
-        self.recordings.forget()
+        self.graphs.clear()

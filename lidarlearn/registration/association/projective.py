@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarlearn import cuda_graphs
-from lidarlearn.cuda_graphs import Padding, Recordings
+from lidarlearn.cuda_graphs import GraphCache, Padding
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.normals import normal_map
 from lidarlearn.geometry.projection import SphericalProjection, nearest_per_bin
@@ -19,7 +19,7 @@ from lidarlearn.registration.association.base import Association, Neighbours
 from lidarlearn.registration.association.candidates import nearest_two
 from lidarlearn.registration.association.point_buffer import PointBuffer
 
-_PADDING, _MAP_PADDING = Padding(), Padding(least=1 << 19)
+_PADDING, _MAP_PADDING = Padding(), Padding(step=1 << 19)
 
 
 class Projective(Association):
@@ -70,9 +70,9 @@ class Projective(Association):
         return self._buffer.normals
 
     @property
-    def recordings(self) -> Recordings:
-        """Recordings of functions that search this map."""
-        return self._buffer.recordings
+    def graphs(self) -> GraphCache:
+        """CUDA graphs of functions that search this map."""
+        return self._buffer.graphs
 
     def points_at(self, index: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
         """`points[index]`."""
@@ -84,7 +84,7 @@ class Projective(Association):
 
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
         """Add a registered scan, and project it into the image, or the whole map into a new image."""
-        vertices, normals, is_used = self._recorded(self._surface, points, T_world_lidar, padding=_PADDING)
+        vertices, normals, is_used = self._in_graph(self._surface, points, T_world_lidar, padding=_PADDING)
         used = is_used.nonzero()[:, 0]
         self._buffer.forget(frames - 1)
         moved = self._buffer.append(vertices.index_select(1, used), normals.index_select(1, used).mT)
@@ -95,12 +95,12 @@ class Projective(Association):
         else:
             if moved:
                 self._layers -= moved
-            new = self._recorded(self._layer, vertices, is_used)
+            new = self._in_graph(self._layer, vertices, is_used)
             self._layers[:, self._next_layer] = torch.where(new < 0, -1, new + (self._buffer.end - len(used)))
             self._next_layer = (self._next_layer + 1) % frames
 
-    def _recorded(self, function: Callable[..., Any], *inputs: Tensor, padding: Padding | None = None) -> Any:
-        return self.recordings(function, *inputs, device=self._device, settings=function.__name__, padding=padding)
+    def _in_graph(self, function: Callable[..., Any], *inputs: Tensor, padding: Padding | None = None) -> Any:
+        return self.graphs(function, *inputs, device=self._device, settings=function.__name__, padding=padding)
 
     def _surface(
         self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"]
@@ -132,7 +132,7 @@ class Projective(Association):
         """Whether a scan is too far from the image's pose, or the image has another number of layers."""
         if self._layers.shape[1] != frames:
             self._layers = self._layers.new_empty(self.projection.pixels, frames)
-            self.recordings.forget()
+            self.graphs.clear()
             return True
         T_image_lidar = self._T_image_world.cpu() @ T_world_lidar.cpu().double()
         distance_m = T_image_lidar[:3, 3].norm().item()
@@ -141,15 +141,15 @@ class Projective(Association):
 
     def _project(self, layers: int) -> Int[Tensor, "pixels layers"]:
         """Slot of the nearest point of each scan in each pixel, a layer a scan; -1 for none."""
-        if not cuda_graphs.are_used_on(self._device):
+        if not cuda_graphs.supported_on(self._device):
             return self._nearest_slots(self._buffer.coordinates, self._buffer.scans, layers)
         count = _MAP_PADDING.length(len(self.points))
         numbers = torch.tensor([len(self.points), self._buffer.oldest_scan])
-        project = functools.partial(self._project_recorded, count, layers)
-        return self.recordings(project, numbers, device=self._device, settings=("_project", count, layers))
+        project = functools.partial(self._project_in_graph, count, layers)
+        return self.graphs(project, numbers, device=self._device, settings=("_project", count, layers))
 
-    def _project_recorded(self, count: int, layers: int, numbers: Int[Tensor, "2"]) -> Int[Tensor, "pixels layers"]:
-        """The same for a padded number of points, some of which are repeated."""
+    def _project_in_graph(self, count: int, layers: int, numbers: Int[Tensor, "2"]) -> Int[Tensor, "pixels layers"]:
+        """The same for a fixed number of points, reached by repeating some."""
         points, oldest_scan = numbers
         slots = self._buffer.origin + torch.arange(count, device=self._device) % points
         coordinates, scans = self._buffer.at(slots)

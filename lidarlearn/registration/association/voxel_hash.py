@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarlearn import cuda_graphs
-from lidarlearn.cuda_graphs import Recordings
+from lidarlearn.cuda_graphs import GraphCache
 from lidarlearn.registration.association.base import Neighbours
 from lidarlearn.registration.association.candidates import NearestTwo, joined, nearest_two
 from lidarlearn.registration.association.voxel_map import voxels_reached
@@ -30,9 +30,9 @@ class VoxelHash(VoxelMapAssociation):
     """
 
     @property
-    def recordings(self) -> Recordings:
-        """Recordings of functions that search this map."""
-        return self._map.recordings
+    def graphs(self) -> GraphCache:
+        """CUDA graphs of functions that search this map."""
+        return self._map.graphs
 
     def reach_m(self, max_distance_m: float) -> float:
         """One of three: 1.5 voxels, 2 voxels, or unlimited."""
@@ -41,7 +41,7 @@ class VoxelHash(VoxelMapAssociation):
 
     def nearest(self, points_world: Float[Tensor, "n 3"], bins: Int[Tensor, "n"], max_distance_m: float) -> Neighbours:
         """Search wider and wider cubes of voxels around each point, until no other point can be nearer."""
-        if cuda_graphs.are_used_on(points_world.device):
+        if cuda_graphs.supported_on(points_world.device):
             return self._nearest_at_once(points_world, bins, max_distance_m)
         widest = max(_MIN_RADIUS, min(math.ceil(max_distance_m / self._voxel_size_m), _MAX_RADIUS))
         radius = 1

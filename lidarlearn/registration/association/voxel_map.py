@@ -23,7 +23,7 @@ from lidarlearn.registration.association.point_buffer import PointBuffer
 # at 0.4 m. So neighbouring voxels never collide, and their entries are close in memory. Of two points that share an
 # entry, as 7 of 97,000 do on a motorway, the later one is found.
 _TABLE_BITS = (9, 9, 6)
-_PADDING = cuda_graphs.Padding(least=1 << 12)  # with NaN, which is no point
+_PADDING = cuda_graphs.Padding(step=1 << 12)  # with NaN, which is no point
 _MIN_NEIGHBOURS = 5
 _MAX_ROUGHNESS = 0.5  # deviation from the plane, relative to the smaller extent in it
 _MIN_EXTENT = 0.15  # smaller extent in the plane, relative to the voxel size: a line of points has no normal
@@ -53,16 +53,16 @@ class VoxelMap(PointBuffer):
     def insert(self, points_world: Float[Tensor, "n 3"], frames: int) -> None:
         """Add the points that fall into free voxels as one scan; keep the last `frames` scans."""
         self.forget(frames - 1)
-        is_free = self._recorded(self._is_free, points_world)
+        is_free = self._in_graph(self._is_free, points_world)
         points_world = points_world[is_free[: len(points_world)]]
-        points_world = points_world[grid_sample(points_world, self.voxel_size_m, self.recordings)]
+        points_world = points_world[grid_sample(points_world, self.voxel_size_m, self.graphs)]
         count = len(points_world)
-        padding = _PADDING.length(count) - count if cuda_graphs.are_used_on(self._device) else 0
+        padding = _PADDING.length(count) - count if cuda_graphs.supported_on(self._device) else 0
         new, _ = self._allocate(count, spare=padding)
-        self._recorded(self._add, points_world, torch.tensor(new.start))
+        self._in_graph(self._add, points_world, torch.tensor(new.start))
 
-    def _recorded(self, function: Callable[..., Any], *inputs: Tensor) -> Any:
-        return self.recordings(function, *inputs, device=self._device, settings=function.__name__, padding=_PADDING)
+    def _in_graph(self, function: Callable[..., Any], *inputs: Tensor) -> Any:
+        return self.graphs(function, *inputs, device=self._device, settings=function.__name__, padding=_PADDING)
 
     def _is_free(self, points_world: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         return self.lookup(voxel_cells(points_world, self.voxel_size_m)) < 0
@@ -138,7 +138,7 @@ class VoxelMap(PointBuffer):
         """Pairs of a new point, already in the table, and a point in one of the 26 voxels around it."""
         candidates = self._candidates(cells, 1)
         occupied = candidates >= self.origin
-        if cuda_graphs.are_used_on(self._device):  # without asking how many pairs there are
+        if cuda_graphs.supported_on(self._device):  # without reading the number of pairs
             new = torch.arange(len(cells), device=self._device)[:, None].expand_as(candidates).flatten()
             neighbour, occupied = candidates.clamp_(min=self.origin).flatten().long(), occupied.flatten()
         else:
@@ -148,11 +148,11 @@ class VoxelMap(PointBuffer):
         # An entry may belong to another voxel.
         is_near = (offsets.abs().amax(dim=1) <= 1) & (offsets != 0).any(dim=1) & occupied & is_point[new]
         pairs = _Pairs(new, neighbour, is_near)
-        return pairs if cuda_graphs.are_used_on(self._device) else pairs.valid()
+        return pairs if cuda_graphs.supported_on(self._device) else pairs.valid()
 
     def _fit(self, slots: Int[Tensor, "m"]) -> None:
         """Update the normals of some slots from their moments."""
-        if not cuda_graphs.are_used_on(self._device):
+        if not cuda_graphs.supported_on(self._device):
             slots = self._distinct(slots)
         moments = self._moments[slots]
         n = moments[:, :1] + 1  # the point itself, at offset zero

@@ -1,4 +1,4 @@
-"""What a GPU is asked for by recordings gives the poses that the CPU gives without."""
+"""Odometries with (fake) CUDA graphs find the poses that they find without."""
 
 import pytest
 import torch
@@ -10,67 +10,67 @@ from lidarlearn.odometry.initialization.posenet import PoseNetInitialization
 from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
 from lidarlearn.registration.association import point_buffer
 from lidarlearn.training.trained_network import TrainedNetwork
-from tests import pretended_graphs
+from tests import fake_cuda_graphs
 from tests.gpu import on_gpu
 from tests.odometry.odometries import build, motion_errors, poses, run, scans, scans_of, slow, street
 
-recorded = pytest.mark.parametrize("association", ["vh", "p"])
+captured = pytest.mark.parametrize("association", ["vh", "p"])
 
 
 def built(backend: str, *overrides: str) -> ScanByScan:
-    """With all points from the first step on, as those are that are recorded."""
+    """Every step uses all points, as with CUDA graphs."""
     return build(f"cv+{backend}", f"odometry.{backend}.registration.coarse_stride=1", *overrides)
 
 
-@recorded
+@captured
 @pytest.mark.parametrize("map_", ["f2m", pytest.param("f2f", marks=slow)])
-def test_a_recorded_drive_is_the_same(association, map_, monkeypatch):
-    """Images are begun anew, and buffers are filled, moved and made larger on the way."""
+def test_a_drive_is_the_same(association, map_, monkeypatch):
+    """On the way new images are started, and buffers are filled, moved and enlarged."""
     drive = scans_of(street(yaw_step=0.03))
-    here = run(built(f"{association}_{map_}"), drive)
-    made = pretended_graphs.pretend(monkeypatch)
+    eager = run(built(f"{association}_{map_}"), drive)
+    graphs = fake_cuda_graphs.install(monkeypatch)
     monkeypatch.setattr(point_buffer, "_INITIAL_CAPACITY_ON_GPU", 1 << 14)
-    there = run(built(f"{association}_{map_}"), drive)
-    translations, angles = motion_errors(poses(there), poses(here))
+    replayed = run(built(f"{association}_{map_}"), drive)
+    translations, angles = motion_errors(poses(replayed), poses(eager))
     assert translations.max() < 5e-4 and angles.max() < 5e-3  # less than a step that ends a registration
-    assert len(made) >= 8
-    for a, b in zip(here, there, strict=True):
+    assert len(graphs) >= 8
+    for a, b in zip(eager, replayed, strict=True):
         assert (a.health.status, a.health.points) == (b.health.status, b.health.points)
         assert a.health.overlap == pytest.approx(b.health.overlap, abs=1e-3)
         assert a.health.min_information == pytest.approx(b.health.min_information, abs=1e-3)
 
 
-@recorded
-def test_a_recorded_drive_recovers_the_same(association, monkeypatch):
-    """From a lost scan, an empty one, a repeated one and a gap after which the map is begun anew."""
+@captured
+def test_recoveries_are_the_same(association, monkeypatch):
+    """From a lost scan, an empty one, a repeated one and a gap after which a new map is started."""
     some = scans()
     drive = [*some[:4], *some[5:7], torch.zeros(0, 3), some[8], some[8], *[torch.zeros(0, 3)] * 6, *some[9:12]]
-    here = run(built(f"{association}_f2m"), drive)
-    pretended_graphs.pretend(monkeypatch)
-    there = run(built(f"{association}_f2m"), drive)
-    assert [frame.health.status for frame in here] == [frame.health.status for frame in there]
-    translations, angles = motion_errors(poses(there), poses(here))
+    eager = run(built(f"{association}_f2m"), drive)
+    fake_cuda_graphs.install(monkeypatch)
+    replayed = run(built(f"{association}_f2m"), drive)
+    assert [frame.health.status for frame in eager] == [frame.health.status for frame in replayed]
+    translations, angles = motion_errors(poses(replayed), poses(eager))
     assert translations.max() < 1e-3 and angles.max() < 1e-2
 
 
 @pytest.mark.parametrize(("group", "option"), [("residual", "generalized_icp"), ("weight", "cauchy")])
-def test_other_settings_are_recorded_or_left_alone(group, option, monkeypatch):
+def test_other_settings_are_captured_or_run_eagerly(group, option, monkeypatch):
     override = f"{group}@odometry.vh_f2m.registration.{group}={option}"
-    here = run(built("vh_f2m", override), scans()[:6])
-    pretended_graphs.pretend(monkeypatch)
-    there = run(built("vh_f2m", override), scans()[:6])
-    translations, angles = motion_errors(poses(there), poses(here))
+    eager = run(built("vh_f2m", override), scans()[:6])
+    fake_cuda_graphs.install(monkeypatch)
+    replayed = run(built("vh_f2m", override), scans()[:6])
+    translations, angles = motion_errors(poses(replayed), poses(eager))
     assert translations.max() < 1e-3 and angles.max() < 1e-2
 
 
-def test_a_recorded_network_says_the_same(monkeypatch):
+def test_a_network_estimates_the_same(monkeypatch):
     network = TrainedNetwork(PoseNet().eval(), SphericalProjection(), torch.device("cpu"))
-    here = poses(run(InitializationAlone(PoseNetInitialization(network)), scans()[:5]))
-    made = pretended_graphs.pretend(monkeypatch)
-    there = poses(run(InitializationAlone(PoseNetInitialization(network)), scans()[:5]))
-    assert len(made) == 2
-    torch.testing.assert_close(there, here, rtol=0, atol=1e-6)
-    assert not torch.equal(here[1], se3.identity())
+    eager = poses(run(InitializationAlone(PoseNetInitialization(network)), scans()[:5]))
+    graphs = fake_cuda_graphs.install(monkeypatch)
+    replayed = poses(run(InitializationAlone(PoseNetInitialization(network)), scans()[:5]))
+    assert len(graphs) == 2
+    torch.testing.assert_close(replayed, eager, rtol=0, atol=1e-6)
+    assert not torch.equal(eager[1], se3.identity())
 
 
 @on_gpu
