@@ -1,4 +1,4 @@
-"""Odometries by others, run and scored like our own; each needs its own package."""
+"""Odometries of other projects, run and scored like our own. Each needs its package installed."""
 
 import importlib
 from types import ModuleType
@@ -18,7 +18,7 @@ class KissIcp(ScanByScan):
     Args:
         min_range_m: closer returns are dropped [m].
         max_range_m: farther returns are dropped [m].
-        voxel_size_m: of its map [m]; None is a hundredth of the range.
+        voxel_size_m: voxel size of its map [m]; None takes a hundredth of `max_range_m`.
 
     Source: Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
     """
@@ -31,18 +31,18 @@ class KissIcp(ScanByScan):
         config = load_config(None)
         config.data.min_range, config.data.max_range = min_range_m, max_range_m
         config.mapping.voxel_size = voxel_size_m or max_range_m / 100
-        config.data.deskew = True  # without times there is nothing to compensate
+        config.data.deskew = True  # has no effect on scans without times
         self._odometry = KissICP(config)
         self._frames = 0
 
     def register_scan(self, points: Points, times: Times | None = None) -> Frame:
-        """Its pose at the instant that times are relative to; without times, nothing is deskewed."""
+        """The pose at the instant to which the times are relative. Scans without times are not deskewed."""
         points, times = as_scan(points, times)
         used = points.isfinite().all(dim=1)
         stamps = torch.zeros(0) if times is None else times[used]
         self._odometry.register_frame(points[used].double().cpu().numpy(), stamps.double().cpu().numpy())
         T_world_lidar = torch.from_numpy(self._odometry.last_pose.copy())
-        if len(stamps):  # deskewed, its pose is that of the last point
+        if len(stamps):  # KISS-ICP deskews to the time of the last point
             motion = se3.log(torch.from_numpy(self._odometry.last_delta.copy()))
             T_world_lidar = se3.orthonormalize(T_world_lidar @ se3.exp(-stamps.max().item() * motion))
         health = Health(self._frames, initialization="kiss_icp", points=int(used.sum()))
@@ -51,13 +51,13 @@ class KissIcp(ScanByScan):
 
 
 class SmallGicp(ScanByScan):
-    """small_gicp: generalized ICP to an incremental voxel map, from a constant-velocity guess; it does not deskew.
+    """small_gicp: generalized ICP against an incremental voxel map, initialized by constant velocity. No deskewing.
 
     Args:
-        voxel_size_m: of the map [m].
-        sampling_m: grid on which scans are sampled [m].
-        search_distance_m: of correspondences [m].
-        threads: that it may use.
+        voxel_size_m: voxel size of the map [m].
+        sampling_m: voxel size to which scans are downsampled [m].
+        search_distance_m: largest distance between corresponding points [m].
+        threads: number of threads.
 
     Source: Koide, "small_gicp: Efficient and parallel algorithms for point cloud registration", JOSS 2024.
     """
@@ -73,7 +73,7 @@ class SmallGicp(ScanByScan):
         self._frames = 0
 
     def register_scan(self, points: Points, times: Times | None = None) -> Frame:
-        """Its pose of the scan; times are not used. A scan without points moves on as the last one did."""
+        """The pose of the scan; times are ignored. For a scan without points, the last motion is repeated."""
         points, times = as_scan(points, times)
         used = points[points.isfinite().all(dim=1)].double().cpu().numpy()
         guess = self._T_world_lidar @ self._motion

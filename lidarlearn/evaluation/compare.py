@@ -1,4 +1,4 @@
-"""Results of several runs side by side: what was measured under the same protocol in one table, the rest apart."""
+"""Results of several runs side by side. Runs share a table if they were measured under the same protocol."""
 
 import itertools
 import json
@@ -15,26 +15,26 @@ from lidarlearn.evaluation.table_layout import TableLayout
 from lidarlearn.evaluation.tables import Table
 from lidarlearn.metrics.kitti import SegmentAverage
 
-# Two results are comparable where these agree...
+# Two runs are comparable if their protocols agree in these entries...
 _PROTOCOL = ("beam_correction_deg", "deskew", "max_frames")
-# ...and these of the sequences that they share; results of earlier versions tell nothing of the ground truth.
+# ...and in these for each common sequence. Results of earlier versions do not describe the ground truth.
 _OF_SEQUENCES = {"scans": "scans", "ground_truth": "ground truth"}
 
-_DIGESTS = ("network", "code")  # settings of which a few digits are enough to tell them apart
+_DIGESTS = ("network", "code")  # hashes, of which only the first digits are shown
 
-Settings = dict[str, Any]  # dotted keys and plain values
+Settings = dict[str, Any]  # plain values by dotted key
 
 
 @dataclass(frozen=True)
 class Run:
-    """What an evaluation left in its folder.
+    """The results in an evaluation's run folder.
 
     Args:
         folder: the run folder.
-        protocol: of `results.json`.
-        scores: its rows.
-        settings: what each method and sequence was run with; nothing for trajectories of other tools.
-        layout: how its experiment sums up the sequences.
+        protocol: the protocol in `results.json`.
+        scores: the rows in `results.json`.
+        settings: the settings of each method on each sequence; empty for trajectories of other tools.
+        layout: the table of its experiment; None without an experiment.
     """
 
     folder: Path
@@ -46,11 +46,11 @@ class Run:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that are comparable, as one table.
+    """Comparable runs, which share a table.
 
     Args:
-        runs: in the order given.
-        scores: all rows; where the same method was run with different settings, its name says which.
+        runs: the runs, in the given order.
+        scores: all rows. If a method was run with different settings, its names in the rows state them.
         seen: methods, by these names, and sequences on which their networks were trained.
     """
 
@@ -60,13 +60,13 @@ class Group:
 
     @property
     def title(self) -> str:
-        """Data and protocol in a line."""
+        """Data and protocol in one line."""
         protocol = self.runs[0].protocol
         data = ", ".join(dict.fromkeys(str(run.protocol.get("data")) for run in self.runs))
         return f"{data}: " + ", ".join(f"{key} {json.dumps(protocol.get(key))}" for key in _PROTOCOL)
 
     def tables(self, layout: TableLayout | None = None) -> list[Table]:
-        """The same tables as of a single evaluation."""
+        """The same tables as for a single evaluation."""
         return report_tables(str(self.runs[0].protocol.get("data", "")), self.scores, self.seen, layout)
 
 
@@ -74,7 +74,7 @@ def read_run(folder: Path) -> Run:
     """Read a run folder.
 
     Raises:
-        UserError: it holds no results of an evaluation.
+        UserError: the folder holds no results of an evaluation.
     """
     path = folder / "results.json"
     if not path.is_file():
@@ -97,14 +97,14 @@ def read_run(folder: Path) -> Run:
 
 
 def differences(a: Run, b: Run) -> list[str]:
-    """Why two runs are not comparable; nothing where they are."""
+    """Why two runs are not comparable; empty if they are."""
     found = [
         f"{key}: {json.dumps(a.protocol.get(key))} against {json.dumps(b.protocol.get(key))}"
         for key in _PROTOCOL
         if a.protocol.get(key) != b.protocol.get(key)
     ]
     if found:
-        return found  # which is why the following differs, too
+        return found  # this also explains any difference below
     for key, what in _OF_SEQUENCES.items():
         mine, theirs = a.protocol.get(key, {}), b.protocol.get(key, {})
         other = [name for name in mine if name in theirs and mine[name] != theirs[name]]
@@ -114,7 +114,7 @@ def differences(a: Run, b: Run) -> list[str]:
 
 
 def comparable_groups(runs: Iterable[Run]) -> list[Group]:
-    """Runs sorted into groups, within each of which all are comparable."""
+    """Sort runs into groups of comparable runs."""
     groups: list[list[Run]] = []
     for run in runs:
         group = next((g for g in groups if not any(differences(other, run) for other in g)), None)
@@ -126,10 +126,10 @@ def comparable_groups(runs: Iterable[Run]) -> list[Group]:
 
 
 def comparison(groups: list[Group]) -> tuple[dict[str, Any], list[Table], str]:
-    """What to write and print about groups of runs: content of `results.json`, tables, and a last section.
+    """The report on groups of runs: the content of `results.json`, the tables, and a closing section.
 
-    Where all runs are of one experiment, its table comes first, with the rows of all of them; or one for each group, if
-    two of them measured the same.
+    If all runs belong to one experiment, its table comes first, with the rows of all runs. If two groups measured the
+    same method on the same sequence, each group gets such a table instead.
     """
     content = {
         "compared": [
@@ -144,7 +144,7 @@ def comparison(groups: list[Group]) -> tuple[dict[str, Any], list[Table], str]:
     tables = []
     if layout is not None and len({(row.method, row.sequence) for row in scores}) == len(scores):
         tables.append(layout.table(scores, {pair for group in groups for pair in group.seen}))
-        layout = None  # of each group
+        layout = None  # not once more for each group
     for i, group in enumerate(groups):
         heading = "" if len(groups) == 1 else f" ({i + 1} of {len(groups)}: {group.title})"
         tables += [replace(table, title=table.title + heading) for table in group.tables(layout)]
@@ -158,10 +158,9 @@ def _closing(groups: list[Group]) -> str:
         lines.append(f"{prefix}{group.title}")
         lines += [f"   - {run.folder}: {_measured_with(run)}" for run in group.runs]
     lines += [
-        f"\nNot comparable: {i + 1} and {k + 1}, {'; '.join(differences(a.runs[0], b.runs[0]))}."
-        for i, a in enumerate(groups)
-        for k, b in enumerate(groups[i + 1 :], i + 1)
-        if differences(a.runs[0], b.runs[0])
+        f"\nNot comparable: {i} and {k}, {'; '.join(why)}."
+        for (i, a), (k, b) in itertools.combinations(enumerate(groups, 1), 2)
+        if (why := differences(a.runs[0], b.runs[0]))
     ]
     return "\n".join(lines) + "\n"
 
@@ -172,7 +171,7 @@ def _measured_with(run: Run) -> str:
 
 
 def _group(runs: list[Run]) -> Group:
-    """All rows, sequence by sequence within each method."""
+    """A group with the rows of all runs, sorted by method, then by the name with its settings."""
     by_method: dict[str, dict[str, list[Score]]] = {}
     seen = set()
     for run, labels in zip(runs, _labels(runs), strict=True):
@@ -186,9 +185,10 @@ def _group(runs: list[Run]) -> Group:
 
 
 def _labels(runs: list[Run]) -> list[dict[tuple[str, str], str]]:
-    """What to call each method and sequence of each run: methods whose settings differ say by what.
+    """For each run, the names in the table by method and sequence.
 
-    What several runs have alike is told apart by their folders, but for the first of them.
+    Methods whose settings differ are named with these settings. If several runs measured the same, all but the first
+    are named with their folders.
     """
     taken: set[tuple[str, str]] = set()
     result = []
@@ -205,17 +205,17 @@ def _labels(runs: list[Run]) -> list[dict[tuple[str, str], str]]:
 
 
 def _distinct_folders(runs: list[Run]) -> list[str]:
-    """The shortest ends of the runs' paths that tell all of them apart."""
+    """The shortest endings of the runs' paths that are all different."""
     paths = [run.folder.resolve().parts for run in runs]
     length = next(n for n in itertools.count(1) if len({path[-n:] for path in paths}) == len(set(paths)))
     return ["/".join(path[-length:]) for path in paths]
 
 
 def _variation(settings: Settings, variants: list[Settings]) -> str:
-    """Those settings that differ between the variants, in brackets, by the last words of their names where these do.
+    """The settings that differ between variants, in brackets, such as " [weight=Huber]"; empty if none differ.
 
-    A part is called by its class, as in "weight=Huber". The sensor's projection belongs to the data. Variants of which
-    nothing is known, as of another tool's trajectories, differ in nothing.
+    Keys are shortened to their last words if these are unique, targets to the names of their classes. The projection
+    is left out because it belongs to the data. Variants without settings (other tools' trajectories) do not count.
     """
     known = dict.fromkeys(key for variant in variants for key in variant if "projection" not in key.split("."))
     keys = [key for key in known if len({repr(variant.get(key)) for variant in variants if variant}) > 1]

@@ -1,7 +1,7 @@
-"""How far off an initial pose may be for a registration to find the right one: basins of convergence.
+"""Basins of convergence: how far off an initial pose may be for a registration to find the right pose.
 
-The right one is where the registration ends that starts from the true pose. Ground truth itself is, on real drives, off
-by more than a registration: against a map of scans of KITTI 04 at their true poses, one ends 0.1 m from the truth.
+The right pose is the one at which a registration from the true pose ends. On real drives, the true poses themselves are
+less accurate than registrations: against a map of KITTI 04 built with them, registrations end 0.1 m away from them.
 """
 
 import math
@@ -21,22 +21,22 @@ from lidarlearn.geometry import se3
 from lidarlearn.geometry.ranges import in_range
 from lidarlearn.odometry.backend import Backend
 
-_AT_ONCE = 8  # initial poses registered together, which bounds the memory
+_AT_ONCE = 8  # number of initial poses registered together; bounds the memory
 
 
 @dataclass(frozen=True)
 class Probe:
-    """What is tried.
+    """The initial poses to try, and the criterion of success.
 
     Args:
-        offsets_m: lengths by which the initial position is off, each in several horizontal directions [m].
-        angles_deg: angles by which the initial yaw is off, to both sides [deg].
-        directions: number of directions for each length.
-        every: only each n-th scan is tried; the others fill the map.
+        offsets_m: errors of the initial position, each in several horizontal directions [m].
+        angles_deg: errors of the initial yaw, each to both sides [deg].
+        directions: number of directions for each offset.
+        every: only every n-th scan is tried; the others only extend the map.
         min_range_m: closer returns are dropped [m].
         max_range_m: farther returns are dropped [m].
-        success_m: a registration succeeds when it ends closer than this to where it ends from the true pose [m]...
-        success_deg: ...and turned by less [deg].
+        success_m: a registration succeeds if it ends within this distance [m]...
+        success_deg: ...and this angle [deg] of where it ends from the true pose.
     """
 
     offsets_m: Collection[float] = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0)
@@ -51,14 +51,14 @@ class Probe:
 
 @dataclass(frozen=True)
 class Basin:
-    """Share of registrations that succeed.
+    """The share of registrations that succeed.
 
     Args:
         scans: number of scans that were tried.
-        by_offset_m: share by length of the initial offset [m].
+        by_offset_m: share by initial error of the position [m].
         by_angle_deg: share by initial error of the yaw [deg].
-        from_truth_m: mean distance to the true pose at which registrations end that start from it [m].
-        from_truth_deg: the same of the rotation [deg].
+        from_truth_m: mean distance from the true pose at which registrations end that start from it [m].
+        from_truth_deg: the corresponding angle [deg].
     """
 
     scans: int
@@ -75,21 +75,21 @@ def convergence_basin(
     device: torch.device | str = "cpu",
     advance: Callable[[], None] = lambda: None,
 ) -> Basin:
-    """Register scans from wrong initial poses, against a map of the scans before them at their true poses.
+    """Register scans from wrong initial poses, against a map of all earlier scans at their true poses.
 
     Args:
-        backend: a fresh one.
-        sequence: with ground truth.
-        probe: what is tried.
-        device: where the backend's map is.
+        backend: a new backend.
+        sequence: a sequence with ground truth.
+        probe: the initial poses to try.
+        device: device of the backend's map.
         advance: called after each scan.
 
     Raises:
-        UserError: the sequence has no ground truth, or too few scans to try one.
+        UserError: the sequence has no ground truth, or too few scans.
     """
     T_true = sequence.T_world_lidar
     if T_true is None:
-        raise UserError(f"sequence {sequence.name} has no ground truth, about which initial poses lie: choose another")
+        raise UserError(f"sequence {sequence.name} has no ground truth to start from: choose another")
     if len(sequence) <= probe.every:
         raise UserError(f"sequence {sequence.name} has {len(sequence)} scans: set probe.every to fewer")
     T_error = torch.cat([se3.identity(1), _shifts(probe), _turns(probe)])
@@ -120,7 +120,7 @@ def convergence_basin(
 
 
 def basin_tables(basins: Mapping[str, Basin]) -> list[Table]:
-    """Success rates, and what they are measured against, one row a backend."""
+    """Success rates, and the accuracy of registrations from the true pose; one row per backend."""
     by_unit: list[tuple[str, str, dict[str, Mapping[float, float]]]] = [
         ("offset of the position [m]", " m", {name: b.by_offset_m for name, b in basins.items()}),
         ("error of the yaw [deg]", " deg", {name: b.by_angle_deg for name, b in basins.items()}),
@@ -141,7 +141,7 @@ def basin_tables(basins: Mapping[str, Basin]) -> list[Table]:
 
 
 def basin_figure(title: str, basins: Mapping[str, Basin]) -> Figure:
-    """Success over the initial error, one curve a backend."""
+    """Success rate over the initial error, one curve per backend."""
 
     def percent(shares: Mapping[float, float]) -> dict[float, float]:
         return {step: 100 * share for step, share in shares.items()}
@@ -159,7 +159,7 @@ def basin_figure(title: str, basins: Mapping[str, Basin]) -> Figure:
 def _registered(
     backend: Backend, points: Tensor, normals: Tensor | None, T_initial: Float[Tensor, "h 4 4"]
 ) -> Float[Tensor, "h 4 4"]:
-    """Where registrations end, from each of the initial poses."""
+    """The poses at which registrations from the initial poses end."""
     ends = [
         backend.registration.register(
             points, backend.local_map.association, T_some, backend.max_search_distance_m, normals
@@ -172,7 +172,7 @@ def _registered(
 def _distances(
     T: Float[Tensor, "*h 4 4"], T_other: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "*h"], Float[Tensor, "*h"]]:
-    """Between poses and another one [m], and their angles [deg]."""
+    """Distances [m] and angles [deg] of poses from another pose."""
     xi = se3.log(se3.inverse(T_other) @ T)
     return xi[..., :3].norm(dim=-1), xi[..., 3:].norm(dim=-1).rad2deg()
 

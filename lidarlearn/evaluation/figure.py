@@ -1,4 +1,4 @@
-"""What all figures have in common: letters of any script, labels and grid, and a legend that hides nothing."""
+"""What all figures share: text in any script, labels and grid, and a legend that hides nothing."""
 
 import warnings
 
@@ -10,8 +10,8 @@ from matplotlib.font_manager import fontManager
 from matplotlib.legend import Legend
 from matplotlib.text import Text
 
-_LINE_INCHES = 0.215  # of a legend
-# Of Linux, Windows and macOS: the usual font has no letters of East Asia.
+_LINE_INCHES = 0.215  # height of one line of a legend
+# Fonts of Linux, Windows and macOS, as Matplotlib's own has no East Asian letters.
 _EAST_ASIAN = (
     "Noto Sans CJK JP",
     "Noto Sans CJK SC",
@@ -29,11 +29,11 @@ _EAST_ASIAN = (
 
 
 class Figure(matplotlib.figure.Figure):
-    """A figure with letters of whatever script there is a font for, wherever it is drawn; boxes stand for others."""
+    """A figure with text in any script that an installed font supports; other letters are drawn as boxes."""
 
     def draw(self, renderer: RendererBase) -> None:
-        """Draw it without a warning of each letter that has no font."""
-        families = _families()
+        """Draw without warnings about letters that no font has."""
+        families = _font_families()
         for text in self.findobj(Text):
             text.set_fontfamily(families)
         with warnings.catch_warnings():
@@ -42,7 +42,7 @@ class Figure(matplotlib.figure.Figure):
 
 
 def finish(axes: Axes, title: str, x: str, y: str) -> None:
-    """Labels and grid as all figures have them; in the title, as it is a name, no $ begins a formula."""
+    """Set labels and grid as in all figures. The title is a name, in which a $ does not begin a formula."""
     axes.set_title(title, loc="left", parse_math=False)
     axes.set_xlabel(x)
     axes.set_ylabel(y)
@@ -52,19 +52,19 @@ def finish(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def legend_beside(figure: Figure, axes: Axes) -> None:
-    """A legend where it hides nothing, on a figure that is high enough; one for axes that show the same methods."""
+    """Add the legend of these axes beside all axes, and make the figure high enough for it."""
     legend = figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
-    hold_names(legend)
+    disable_formulas(legend)
     figure.set_figheight(max(figure.get_figheight(), _LINE_INCHES * (len(legend.texts) + 1)))
 
 
-def hold_names(legend: Legend) -> None:
-    """Let no $ begin a formula in a legend."""
+def disable_formulas(legend: Legend) -> None:
+    """Show a $ in the names of a legend as it is."""
     for text in legend.texts:
         text.set_parse_math(False)
 
 
-def _families() -> list[str]:
-    """Fonts in which letters are looked for, one after the other."""
+def _font_families() -> list[str]:
+    """The fonts to search for each letter, in this order."""
     there = {font.name for font in fontManager.ttflist}
     return [*rcParams["font.family"], *(name for name in _EAST_ASIAN if name in there)]

@@ -12,15 +12,15 @@ from matplotlib.image import AxesImage
 from matplotlib.patheffects import withStroke
 from torch import Tensor
 
-from lidarlearn.evaluation.figure import Figure, finish, hold_names
+from lidarlearn.evaluation.figure import Figure, disable_formulas, finish
 from lidarlearn.geometry.voxels import voxel_cells
 
 _DPI = 150
 _SIDE_IN = 8.5  # longer side of the map [inch]
-_NARROWEST = 0.45  # shorter side over the longer: a straight drive gets some room around it
-_PIXELS = 1300  # of the map along its longer side at most: about what the figure has room for
-_CLIPPED = (0.02, 0.98)  # shares of the pixels at whose heights the colours end
-# Pale ground and dark walls, as on a plan; the palest would not be seen on white.
+_NARROWEST = 0.45  # least ratio of the shorter to the longer side: straight drives get a margin
+_PIXELS = 1300  # most pixels along the longer side: about the resolution of the figure
+_CLIPPED = (0.02, 0.98)  # quantiles of the pixels' heights at which the colour scale ends
+# Pale ground and dark walls, as on a plan. The palest colours are left out: they vanish on white.
 _COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.2, 1, 256)))
 
 
@@ -31,7 +31,7 @@ def map_figure(
     T_estimates: dict[str, Float[Tensor, "m 4 4"]],
     T_true: Float[Tensor, "m 4 4"] | None,
 ) -> Figure:
-    """Bird's-eye view of a map with a scale of its heights; arguments as of `draw_map`."""
+    """Bird's-eye view of a map with a colour scale of its heights; arguments as for `draw_map`."""
     lower, upper = points.amin(0)[:2], points.amax(0)[:2]
     narrowest = (_NARROWEST * (upper - lower).max()).clamp(min=1)
     missing = (narrowest - (upper - lower)).clamp(min=0) / 2
@@ -57,29 +57,29 @@ def draw_map(
     """Draw a map from above, coloured by the height of the highest point of each pixel, and trajectories on top.
 
     Args:
-        axes: where to; x and y get the same scale.
-        points: of the map, in the frame of the first pose [m].
-        pixel_m: edge of the pixels [m]: that of the map's voxels, of which a large map takes several.
-        T_estimates: the poses that it was made with, by method.
-        T_true: ground truth, dashed; None where there is none.
+        axes: axes to draw on; x and y get the same scale.
+        points: points of the map, in the frame of the first pose [m].
+        pixel_m: edge of the pixels [m], usually that of the map's voxels. Large maps get a multiple of it.
+        T_estimates: the poses with which the map was built, by method.
+        T_true: ground-truth poses, drawn dashed; None if there are none.
     """
     heights, extent = _seen_from_above(points, pixel_m)
     lowest, highest = np.nanquantile(heights, _CLIPPED)
     look = {"cmap": _COLOURS, "vmin": lowest, "vmax": highest, "interpolation": "nearest"}
-    image = axes.imshow(heights, extent=extent, origin="lower", zorder=1, **look)  # the grid is below
+    image = axes.imshow(heights, extent=extent, origin="lower", zorder=1, **look)  # above the grid
     outlined = [withStroke(linewidth=4, foreground="white")]
     for method, T in T_estimates.items():
         axes.plot(*T[:, :2, 3].mT.numpy(), color="#d55e00", linewidth=2, path_effects=outlined, label=method)
     if T_true is not None:
         axes.plot(*T_true[:, :2, 3].mT.numpy(), color="black", linewidth=1, linestyle="--", label="ground truth")
-    hold_names(axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False, borderaxespad=0.2))
+    disable_formulas(axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False, borderaxespad=0.2))
     return image
 
 
 def _seen_from_above(
     points: Float[Tensor, "n 3"], pixel_m: float
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Heights of the highest points as an image, NaN where there is none, and its left, right, lower and upper edge."""
+    """Image of the highest point of each pixel (NaN: no point), and its left, right, lower and upper edge [m]."""
     size = float((points.amax(0) - points.amin(0))[:2].max())
     pixel_m *= max(1, math.ceil(size / (pixel_m * _PIXELS)))
     cells = voxel_cells(points, pixel_m)[:, :2].long()

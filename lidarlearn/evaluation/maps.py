@@ -1,4 +1,4 @@
-"""The map of a drive: all scans in the frame of the first, one point a voxel, and how sharp it came out."""
+"""The map of a drive: all scans in the frame of the first, one point per voxel, and the map's sharpness."""
 
 import math
 from collections.abc import Callable
@@ -19,21 +19,21 @@ from lidarlearn.geometry.voxels import VoxelSums, voxel_cells
 from lidarlearn.odometry.deskew import deskew
 
 _NEIGHBOURHOOD_M = 0.5  # edge of the cubes in which the map's sharpness is measured
-_LEAST_NEIGHBOURS = 10  # points in such a cube, for a plane through them to mean something
+_LEAST_NEIGHBOURS = 10  # fewest points of a cube to which a plane is fitted
 
 
 @dataclass(frozen=True)
 class MapSettings:
-    """What of the scans goes into a map.
+    """Which points of the scans go into a map.
 
     Args:
-        voxel_size_m: edge of the voxels, each of which has one point [m].
-        every: use each n-th scan only.
-        min_range_m: closer returns are left out: the vehicle itself [m].
-        max_range_m: farther returns are left out: they are sparse, and an angle's error moves them most [m].
+        voxel_size_m: edge of the voxels, each of which holds one point [m].
+        every: use only every n-th scan.
+        min_range_m: closer returns are left out, as they show the vehicle itself [m].
+        max_range_m: farther returns are left out, as they are sparse and an error of the angle displaces them most [m].
 
     Raises:
-        UserError: nothing would be left.
+        UserError: no point can meet these settings.
     """
 
     voxel_size_m: float = 0.2
@@ -43,12 +43,12 @@ class MapSettings:
 
     def __post_init__(self) -> None:
         if not 0 < self.voxel_size_m < math.inf:
-            raise UserError(f"voxels of {self.voxel_size_m:g} m make no map\n  change: --voxel to more than 0")
+            raise UserError(f"--voxel {self.voxel_size_m:g}: not a size of voxels\n  change: --voxel to more than 0")
         if self.every < 1:
-            raise UserError(f"every {self.every}th scan is none\n  change: --every to 1 or more")
+            raise UserError(f"--every {self.every}: no scan is used\n  change: --every to 1 or more")
         if not 0 <= self.min_range_m < self.max_range_m:
             raise UserError(
-                f"no point is between {self.min_range_m:g} and {self.max_range_m:g} m away\n"
+                f"--min-range {self.min_range_m:g}, --max-range {self.max_range_m:g}: no point is in this range\n"
                 "  change: --min-range and --max-range"
             )
 
@@ -58,8 +58,8 @@ class PointMap:
     """The map of a drive.
 
     Args:
-        points: the mean of the measured points of each voxel [m], float32, in the frame of the first scan.
-        intensities: the mean reflectance, in [0, 1]; None where the scans have none.
+        points: mean of the measured points in each voxel, in the frame of the first scan [m], float32.
+        intensities: mean reflectance in each voxel, in [0, 1]; None if a scan has none.
         mean_plane_variance_m2: see `mean_plane_variance`; None where it is not defined.
     """
 
@@ -69,11 +69,11 @@ class PointMap:
 
     @property
     def extent_m(self) -> list[float]:
-        """Edges of the box around it, along x, y and z [m]."""
+        """Edges of the bounding box along x, y and z [m]."""
         return (self.points.amax(0) - self.points.amin(0)).tolist()
 
     def write(self, path: Path) -> None:
-        """Write it as a .ply file: x, y, z and, where known, intensity; float32, binary."""
+        """Write a binary .ply file of x, y, z and, if known, intensity, in float32."""
         fields = dict(zip("xyz", self.points.mT.contiguous(), strict=True))
         if self.intensities is not None:
             fields["intensity"] = self.intensities
@@ -88,38 +88,38 @@ def build_map(
     deskewed: bool = False,
     advance: Callable[[], None] = lambda: None,
 ) -> PointMap:
-    """Put the scans of a drive where its poses say they were taken.
+    """Merge the scans of a drive into one map.
 
-    Scans are read one by one, and only voxels are kept: a place that is passed again takes no more memory.
+    Scans are read one by one, and only voxels are kept, so revisiting a place takes no more memory.
 
     Args:
         sequence: the scans.
-        T_world_lidar: their poses, by whatever method.
-        settings: what goes into the map.
-        deskewed: whether the motion within a scan is compensated, by the poses before and after it.
+        T_world_lidar: the pose of each scan, from any method.
+        settings: which points go into the map.
+        deskewed: whether to compensate the motion within each scan, from the poses before and after it.
         advance: called after each scan.
 
     Raises:
-        UserError: there is not a pose for every scan, or no point in range.
+        UserError: the numbers of poses and scans differ, or no point is in range.
     """
     if len(T_world_lidar) != len(sequence):
         raise UserError(
             f"{sequence.name}: {len(T_world_lidar)} poses for {len(sequence)} scans\n"
             "  change: data.max_frames or data.root to what the run had, or run evaluate.py again"
         )
-    columns, neighbourhoods, reflecting = VoxelSums(5), VoxelSums(10, torch.float64), True
+    voxels, neighbourhoods, has_intensities = VoxelSums(5), VoxelSums(10, torch.float64), True
     for index in range(0, len(sequence), settings.every):
         scan = _in_range(sequence.scan(index), settings)
         points = deskew(scan.points, scan.times, _motion(T_world_lidar, index)) if deskewed else scan.points
         points_world = se3.transform(T_world_lidar[index], points.double())
         cells, offsets = _placed(points_world, settings.voxel_size_m)
-        reflecting &= scan.intensities is not None
+        has_intensities &= scan.intensities is not None
         intensities = scan.intensities if scan.intensities is not None else torch.zeros(len(points))
-        columns.add(cells, torch.stack([torch.ones(len(points)), *offsets.float().unbind(1), intensities], dim=1))
+        voxels.add(cells, torch.stack([torch.ones(len(points)), *offsets.float().unbind(1), intensities], dim=1))
         cells, offsets = _placed(points_world, _NEIGHBOURHOOD_M)
         neighbourhoods.add(cells, moments(offsets))
         advance()
-    cells, sums = columns.result()
+    cells, sums = voxels.result()
     if not len(cells):
         raise UserError(
             f"{sequence.name}: no point between {settings.min_range_m:g} and {settings.max_range_m:g} m away\n"
@@ -128,27 +128,27 @@ def build_map(
     means = sums[:, 1:] / sums[:, :1]
     points_world = (cells + 0.5).double() * settings.voxel_size_m + means[:, :3]
     _, neighbours = neighbourhoods.result()
-    return PointMap(points_world.float(), means[:, 3] if reflecting else None, mean_plane_variance(neighbours))
+    return PointMap(points_world.float(), means[:, 3] if has_intensities else None, mean_plane_variance(neighbours))
 
 
 def moments(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 10"]:
-    """What is summed of the points of a neighbourhood: 1, x, y, z, and xx, xy, xz, yy, yz, zz."""
+    """The moments of each point, to be summed over a neighbourhood: 1, x, y, z, xx, xy, xz, yy, yz, zz."""
     x, y, z = points.unbind(1)
     return torch.stack([torch.ones_like(x), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z], dim=1)
 
 
 def mean_plane_variance(sums: Float[Tensor, "m 10"]) -> float | None:
-    """How thick the surfaces of a map are: the variance across the plane through each neighbourhood, on average [m^2].
+    """Thickness of a map's surfaces: mean variance across the plane fitted to each neighbourhood [m^2].
 
-    It needs no ground truth: where poses do not fit, walls are seen twice, or blurred. What is not flat adds to it
-    under any poses: it tells methods apart on the same scans, and nothing else. The neighbourhoods of the source are
-    balls around each point; cubes can be summed up while the scans come by.
+    It needs no ground truth: poses that do not fit together double or blur the walls. Surfaces that are not flat
+    increase it under any poses, so it only compares methods on the same scans. The source takes balls around each point
+    as neighbourhoods; cubes can be summed scan by scan.
 
     Args:
-        sums: of the `moments` of the points of each neighbourhood.
+        sums: sums of the `moments` of the points of each neighbourhood.
 
     Returns:
-        The mean over the neighbourhoods that hold enough points; None where none does.
+        The mean over all neighbourhoods with enough points; None if there are none.
 
     Source: Razlaw et al., "Evaluation of registration methods for sparse 3D laser scans", ECMR 2015: MPV.
     """
@@ -166,13 +166,13 @@ def _in_range(scan: Scan, settings: MapSettings) -> Scan:
 
 
 def _motion(T_world_lidar: Float[Tensor, "n 4 4"], index: int) -> Float[Tensor, "4 4"]:
-    """The motion over one scan period: the mean of the one before and the one after, of which an end has one alone."""
+    """The motion during one scan period: the mean of the motions before and after the scan, if both exist."""
     before, after = max(index - 1, 0), min(index + 1, len(T_world_lidar) - 1)
     T_before_after = se3.inverse(T_world_lidar[before]) @ T_world_lidar[after]
     return se3.exp(se3.log(T_before_after) / max(after - before, 1))
 
 
 def _placed(points_world: Float[Tensor, "n 3"], voxel_size_m: float) -> tuple[Int[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """The voxel of each point and the place in it, relative to its centre: small numbers, whose sums lose no digits."""
+    """The voxel of each point, and the point relative to its centre: sums of small numbers lose no digits."""
     cells = voxel_cells(points_world, voxel_size_m)
     return cells, points_world - (cells + 0.5).double() * voxel_size_m

@@ -8,11 +8,11 @@ from lidarlearn.errors import UserError
 
 @dataclass(frozen=True)
 class Method:
-    """A method by its parts.
+    """The parts of a method.
 
     Args:
-        initialization: ni, cv, ei, posenet or the name of another network; or a baseline, which brings its own.
-        backend: e.g. "kd_f2m"; None where the initialization is scored alone, and for baselines.
+        initialization: ni, cv, ei, posenet or the name of another network; or a baseline, which is a whole odometry.
+        backend: e.g. "kd_f2m"; None for an initialization alone and for baselines.
     """
 
     initialization: str
@@ -25,13 +25,13 @@ class Method:
 def parse_method(
     name: str, initializations: Collection[str], backends: Collection[str], baselines: Collection[str] = ()
 ) -> Method:
-    """The method of a name such as "cv+kd_f2m" or "posenet", in any case.
+    """Parse the name of a method, such as "cv+kd_f2m" or "posenet", in upper or lower case.
 
     Args:
-        name: as on the command line.
-        initializations: names of those that there are, networks included.
-        backends: names of those that there are.
-        baselines: names of those that there are.
+        name: the name on the command line.
+        initializations: names of all initializations, including networks.
+        backends: names of all backends.
+        baselines: names of all baselines.
 
     Raises:
         UserError: there is no such method.
@@ -44,7 +44,7 @@ def parse_method(
         raise UserError(
             f"methods: there is no method '{name}'.\n"
             f"  change: <initialization>+<association>_<map>, e.g. cv+kd_f2m, or an initialization alone; "
-            f"initializations are {', '.join(initializations)}, the rest is one of {', '.join(backends)}; "
-            f"for comparison there are {', '.join(baselines)}"
+            f"initializations: {', '.join(initializations)}; <association>_<map>: {', '.join(backends)}; "
+            f"odometries of other projects: {', '.join(baselines)}"
         )
     return Method(first, second if plus else None)

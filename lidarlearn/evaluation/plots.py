@@ -1,11 +1,11 @@
-"""Figures of an evaluation; each function returns a Figure, for a file and for TensorBoard alike.
+"""Figures of an evaluation. Each function returns a Figure, to be written to a file or to TensorBoard.
 
-Figures are made without pyplot, whose list of open figures would grow with a training, and drawn without a screen.
+Pyplot is not used: it would keep every figure of a training open. Figures need no display.
 """
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,20 +28,20 @@ Poses = Float[Tensor, "n 4 4"]
 
 _DPI = 120
 _TRUTH = "#4d4d4d"
-# Okabe and Ito's palette, told apart with any colour vision; the line style changes when it is used up.
+# Okabe and Ito's palette, distinguishable with any colour vision; once it is used up, the line style changes.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 _STYLES = ("-", "--", ":", "-.")
 _KMH = 3.6
-_LEAST_ERROR = 1e-6  # that a logarithmic axis shows [m] or [deg]: none has no place there, and rounding says nothing
+_LEAST_ERROR = 1e-6  # smallest error on a logarithmic axis [m] or [deg], which cannot show 0; below it is rounding
 
 
 def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str, Poses]) -> Figure:
-    """Bird's-eye view of trajectories, all from the same start, to the same scale in both directions.
+    """Bird's-eye view of trajectories, all from the same start, with the same scale in both directions.
 
     Args:
         title: what is shown, e.g. the name of the sequence.
-        T_true: ground-truth poses of the LiDAR; None where there are none.
-        T_estimates: estimated poses of the LiDAR by method.
+        T_true: ground-truth poses of the LiDAR; None if there are none.
+        T_estimates: estimated poses of the LiDAR, by method.
     """
     truth = None if T_true is None else _bird_eye(T_true)
     paths = {method: _bird_eye(T_world) for method, T_world in T_estimates.items()}
@@ -57,35 +57,36 @@ def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     legend_beside(figure, axes)
     finish(axes, title, "x, forward at the start [m]", "y, left at the start [m]")
-    figure.draw_without_rendering()  # room for the labels is made about axes whose aspect only a first drawing settles
+    figure.draw_without_rendering()  # settles the aspect, which the next layout needs to make room for the labels
     return figure
 
 
 def drift_figure(title: str, averages: Mapping[str, Mapping[int, SegmentAverage]]) -> Figure:
-    """KITTI's translation and rotation error over the length of the segment.
+    """KITTI's translation and rotation errors over the length of the segments.
 
     Args:
         title: what is shown.
         averages: mean errors by segment length [m], by method.
     """
-    figure = Figure(figsize=(10, 4), dpi=_DPI, layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for i, (method, by_length) in enumerate(averages.items()):
-        lengths = list(by_length)
-        style: dict[str, Any] = {"marker": "o", "markersize": 4, "label": method, **_line(i)}
-        left.plot(lengths, [a.translation_percent for a in by_length.values()], **style)
-        right.plot(lengths, [a.rotation_deg_per_100m for a in by_length.values()], **style)
-    for axes in (left, right):
-        axes.set_ylim(bottom=0)
-    finish(left, title, "segment length [m]", "translation error [%]")
-    finish(right, "", "segment length [m]", "rotation error [deg/100 m]")
-    legend_beside(figure, left)
-    return figure
+
+    def curves(value: Callable[[SegmentAverage], float]) -> dict[str, dict[float, float]]:
+        return {m: {float(n): value(average) for n, average in lengths.items()} for m, lengths in averages.items()}
+
+    x = "segment length [m]"
+    translation = Panel(x, "translation error [%]", curves(lambda average: average.translation_percent))
+    rotation = Panel(x, "rotation error [deg/100 m]", curves(lambda average: average.rotation_deg_per_100m))
+    return curves_figure(title, [translation, rotation])
 
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves, y by x and by name, that share two axes of these labels."""
+    """Curves in one pair of axes.
+
+    Args:
+        x: label of the x axis.
+        y: label of the y axis.
+        curves: values of y by x, by the name of the curve.
+    """
 
     x: str
     y: str
@@ -93,7 +94,7 @@ class Panel:
 
 
 def curves_figure(title: str, panels: list[Panel]) -> Figure:
-    """Panels side by side, with one legend for the names that they share."""
+    """Panels side by side, with one legend for all of them."""
     figure = Figure(figsize=(10, 4), dpi=_DPI, layout="constrained")
     row = figure.subplots(1, len(panels), squeeze=False)[0]
     for k, (axes, panel) in enumerate(zip(row, panels, strict=True)):
@@ -106,12 +107,12 @@ def curves_figure(title: str, panels: list[Panel]) -> Figure:
 
 
 def speed_figure(title: str, true_kmh: Float[Tensor, "n"], estimated_kmh: Mapping[str, Float[Tensor, "_"]]) -> Figure:
-    """How often each speed was driven, by the ground truth and by the estimates.
+    """Distribution of the speed, according to the ground truth and to the estimates.
 
     Args:
         title: what is shown.
-        true_kmh: speed between scans [km/h]; empty where there is no ground truth.
-        estimated_kmh: the same of the estimates, by method.
+        true_kmh: true speeds between scans [km/h]; empty without ground truth.
+        estimated_kmh: estimated speeds between scans [km/h], by method.
 
     Source: Dellenbach et al. 2021, IV-B, the figure on the distribution of the speed.
     """
@@ -131,14 +132,14 @@ def speed_figure(title: str, true_kmh: Float[Tensor, "n"], estimated_kmh: Mappin
 
 
 def frame_error_figure(title: str, T_true: Poses, T_estimates: Mapping[str, Poses]) -> Figure:
-    """Error of every motion between consecutive scans, on a logarithmic scale, with the limits of a failure.
+    """Error of each motion between consecutive scans, on a logarithmic scale, with the limits of a failure.
 
-    Smaller errors than 1e-6 m or deg are drawn there.
+    Errors below 1e-6 m or deg are drawn at this value.
 
     Args:
         title: what is shown.
         T_true: ground-truth poses.
-        T_estimates: estimated poses by method, as many as there are true ones.
+        T_estimates: estimated poses by method, as many as true ones.
     """
     figure = Figure(figsize=(10, 6), dpi=_DPI, layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
@@ -163,18 +164,18 @@ def figures(
     scores: list[Score],
     groups: Mapping[str, Collection[str]] | None = None,
 ) -> Iterator[tuple[str, Figure]]:
-    """All figures of an evaluation, one by one, with the names of their files.
+    """Yield all figures of an evaluation with their file names.
 
     Args:
-        sequences: opened sequences by name.
+        sequences: sequences by name.
         T_world_lidar: estimated poses of the LiDAR, by method and sequence.
-        scores: of the same methods and sequences.
-        groups: names of sequences by what they have in common; each group gets a distribution of speeds of its own.
+        scores: scores of the same methods and sequences.
+        groups: names of sequences by a common heading; each group gets its own distribution of speeds.
     """
     for name, sequence in sequences.items():
         estimates = {method: poses[name] for method, poses in T_world_lidar.items() if name in poses}
         if not estimates:
-            continue  # an error came first
+            continue  # an error ended the evaluation before this sequence
         yield f"trajectories_{name}", trajectory_figure(f"sequence {name}", sequence.T_world_lidar, estimates)
         if sequence.T_world_lidar is not None and len(sequence) > 1:
             yield f"frame_errors_{name}", frame_error_figure(f"sequence {name}", sequence.T_world_lidar, estimates)
@@ -196,11 +197,11 @@ def write_plots(folder: Path, named_figures: Iterable[tuple[str, Figure]]) -> li
     """Write figures as PNG files.
 
     Args:
-        folder: made if it is not there.
-        named_figures: as `figures` gives them.
+        folder: created if missing.
+        named_figures: names without suffix, and figures.
 
     Returns:
-        The files.
+        The written files.
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -223,7 +224,7 @@ def _bird_eye(T_world: Poses) -> Float[Tensor, "n 2"]:
 
 
 def _view(paths: list[Float[Tensor, "_ 2"]], truth: Float[Tensor, "n 2"] | None) -> Float[Tensor, "2 2"]:
-    """Lower and upper corner of what is shown [m]: everything, unless a path leaves the truth far behind."""
+    """Lower and upper corner of the shown area [m]: all paths, except where they stray far from the truth."""
     points = torch.cat(list(paths))
     corners = torch.stack([points.amin(0), points.amax(0)])
     if truth is not None:
@@ -231,13 +232,13 @@ def _view(paths: list[Float[Tensor, "_ 2"]], truth: Float[Tensor, "n 2"] | None)
         reach = (upper - lower).max()
         corners = torch.stack([corners[0].maximum(lower - reach), corners[1].minimum(upper + reach)])
     extent = (corners[1] - corners[0]).max().clamp(min=1)
-    missing = (0.4 * extent - (corners[1] - corners[0])).clamp(min=0) / 2  # a straight drive gets some room around it
+    missing = (0.4 * extent - (corners[1] - corners[0])).clamp(min=0) / 2  # a margin for straight drives
     margin = 0.05 * extent + missing
     return corners + torch.stack([-margin, margin])
 
 
 def _all_speeds(sequences: Mapping[str, Sequence], poses: Mapping[str, Poses]) -> Float[Tensor, "_"]:
-    """Speeds [km/h] over those of the sequences that have poses and time stamps, one after the other."""
+    """Speeds [km/h] on all sequences with poses and timestamps, concatenated."""
     parts = [torch.zeros(0, dtype=torch.float64)]
     for name, sequence in sequences.items():
         timestamps, T_world = sequence.timestamps, poses.get(name)
@@ -247,7 +248,7 @@ def _all_speeds(sequences: Mapping[str, Sequence], poses: Mapping[str, Poses]) -
 
 
 def _speed_edges(true_kmh: Float[Tensor, "_"], estimated_kmh: Float[Tensor, "_"]) -> list[float]:
-    """Edges of about forty round bins [km/h], up to half as fast again as was driven; faster ones share the last."""
+    """Edges of about forty bins of round width [km/h], up to about 1.5 times the highest true speed."""
     fastest = float(estimated_kmh.max()) if len(estimated_kmh) else 0.0
     if len(true_kmh):
         fastest = max(float(true_kmh.max()), min(fastest, 1.5 * float(true_kmh.max()) + 5))
@@ -256,6 +257,6 @@ def _speed_edges(true_kmh: Float[Tensor, "_"], estimated_kmh: Float[Tensor, "_"]
 
 
 def _histogram(axes: Axes, kmh: Float[Tensor, "n"], edges: list[float], **style: Any) -> None:
-    """Share of the scans [%] in each bin; speeds beyond the last edge count in the last bin."""
+    """Draw the share of the scans [%] in each bin; speeds beyond the last edge count in the last bin."""
     shown = kmh.clamp(max=edges[-1]).numpy()
     axes.hist(shown, edges, weights=np.full(len(shown), 100 / max(1, len(shown))), **style)

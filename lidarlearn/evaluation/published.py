@@ -1,12 +1,12 @@
-"""Average translation errors on KITTI as published, to be printed beside our own.
+"""Published average translation errors on KITTI, to be shown beside our own.
 
-Figures stand as printed in their sources, digits and all, for sequences 00 to 10 in order ("-": not published). They
-hold for whole sequences only. Published rows mix two averages; the mean over sequences is taken here from the row, the
-mean over segments cannot be and is given where it is stated. Numbers after a network's name are the sequences that it
-was trained on.
+The values have exactly the digits of their sources, for sequences 00 to 10 in order ("-": not published), and hold for
+whole sequences only. Publications state one of two averages: the mean over sequences is computed from the row; the
+mean over segments cannot be, and is given if published. Numbers after a network's name are the sequences on which it
+was trained.
 
-Sources: each method's own paper, except LOAM, SuMa and DeepLO: as the later papers quote them. "Dellenbach 2021"
-is the Table I of "What's in My LiDAR Odometry Toolbox?"; "re-run": with the released code and its defaults.
+Sources: each method's own paper; for LOAM, SuMa and DeepLO, later papers that quote them. "Dellenbach 2021" is Table I
+of "What's in My LiDAR Odometry Toolbox?"; "re-run" means with the released code and its defaults.
 """
 
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from lidarlearn.evaluation.score import Score
 
-# Scans in each sequence of the KITTI odometry benchmark that has public ground truth.
+# Number of scans in each sequence of the KITTI odometry benchmark with public ground truth.
 KITTI_FRAMES = {
     "00": 4541,
     "01": 1101,
@@ -35,9 +35,9 @@ class Published:
     """One row of a published table.
 
     Args:
-        method: its name and what sets the row apart.
+        method: name of the method, and what distinguishes the row.
         errors_percent: average translation error by sequence, as printed.
-        segment_mean_percent: mean over the segments of all eleven sequences, as printed; empty where not published.
+        segment_mean_percent: mean over the segments of all eleven sequences, as printed; empty if not published.
     """
 
     method: str
@@ -85,11 +85,11 @@ KITTI = (
 
 
 def whole_kitti_sequences(data: str, scores: Iterable[Score]) -> list[str]:
-    """Which of the scored sequences are whole sequences of the KITTI odometry benchmark, in order of appearance.
+    """The scored sequences that are whole sequences of the KITTI odometry benchmark, in order of appearance.
 
     Args:
         data: name of the data group, e.g. "kitti_00-08".
-        scores: of any methods.
+        scores: scores of any methods.
     """
     if not data.startswith("kitti_") or data == "kitti_raw":
         return []
@@ -98,6 +98,6 @@ def whole_kitti_sequences(data: str, scores: Iterable[Score]) -> list[str]:
 
 
 def published_beside(data: str, scores: Iterable[Score]) -> list[Published]:
-    """Published rows that have a figure for one of the scored sequences, where these are KITTI's, and whole."""
+    """Published rows with a value for at least one of the scored sequences that are whole sequences of KITTI."""
     sequences = whole_kitti_sequences(data, scores)
     return [row for row in KITTI if any(name in row.errors_percent for name in sequences)]

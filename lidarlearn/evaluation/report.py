@@ -16,8 +16,7 @@ from lidarlearn.evaluation.table_layout import TableLayout
 from lidarlearn.evaluation.tables import Table
 
 _UNDEFINED = "-"
-_PIPE_WIDTH = 200  # characters, where there is no terminal to ask
-
+_PIPE_WIDTH = 200  # characters per line, if the output is not a terminal
 
 _DETAILS_NOTES = {
     "rot. [deg/100 m]": "rot.: average rotation error, KITTI metric.",
@@ -41,12 +40,12 @@ def write_report(
     """Write `results.json` and `results.md` into a folder.
 
     Args:
-        folder: the run folder; made if it is not there.
-        protocol: how the scores came about; `protocol["data"]` is the name of the data group. Plain values, paths
-            and nested mappings and lists of these.
-        scores: all methods on all sequences, in the order in which they are to be shown.
+        folder: the run folder, created if missing.
+        protocol: how the scores were obtained: plain values, paths, and nested mappings and lists of these.
+            `protocol["data"]` is the name of the data group.
+        scores: scores of all methods on all sequences, in the order of the rows.
         seen: methods and sequences on which their networks were trained.
-        layout: how an experiment sums up its sequences; None for no table of that kind.
+        layout: the table of an experiment; None for no such table.
     """
     results = {"protocol": protocol, **results_content(scores)}
     if layout is not None:
@@ -56,10 +55,10 @@ def write_report(
 
 
 def write_results(folder: Path, results: Mapping[str, Any], tables: list[Table], closing: str) -> None:
-    """Write `results.json`, and `results.md` with some tables and a last section.
+    """Write `results.json`, and `results.md` with the tables and a closing section.
 
     Raises:
-        TypeError: `results` holds something that JSON cannot.
+        TypeError: `results` holds a value that JSON does not support.
     """
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps(_plain(results), indent=2, allow_nan=False, ensure_ascii=False)
@@ -69,7 +68,7 @@ def write_results(folder: Path, results: Mapping[str, Any], tables: list[Table],
 
 
 def seen_in_training(protocol: Mapping[str, Any], scores: Iterable[Score]) -> set[tuple[str, str]]:
-    """Methods and sequences among some scores of which the method's network was trained on the sequence."""
+    """The scored methods and sequences where the network of the method was trained on the sequence."""
     networks = {"posenet": protocol.get("checkpoint"), **protocol.get("networks", {})}
     names = {name: network["trained_on"]["train_sequences"] or () for name, network in networks.items() if network}
     rows = ((row.method, row.sequence) for row in scores)
@@ -77,13 +76,13 @@ def seen_in_training(protocol: Mapping[str, Any], scores: Iterable[Score]) -> se
 
 
 def results_content(scores: list[Score]) -> dict[str, Any]:
-    """Scores and their averages as `results.json` holds them."""
+    """Scores and their averages, as in `results.json`."""
     averages = average_scores(scores)
     return {"results": [asdict(row) for row in scores], "averages": [asdict(row) for row in averages]}
 
 
 def print_tables(tables: list[Table], console: Console | None = None) -> None:
-    """Print tables to the terminal, or to another console; None takes the standard output."""
+    """Print tables to a console; None takes the standard output."""
     out = console or Console()
     if console is None and not out.is_terminal:
         out = Console(width=_PIPE_WIDTH)
@@ -92,9 +91,11 @@ def print_tables(tables: list[Table], console: Console | None = None) -> None:
 
 
 def report_tables(data: str, scores: list[Score], seen: Seen = (), layout: TableLayout | None = None) -> list[Table]:
-    """The experiment's table; the paper's kind of table, a column a sequence; then everything else, a row each.
+    """All tables of a report.
 
-    Without any ground truth the last alone. Arguments as for `write_report`, `data` being the name of the data group.
+    First the experiment's table, if any; then, if any sequence has ground truth, the paper's kind of table, with one
+    column per sequence; last all other metrics, with one row per method and sequence. Arguments as for `write_report`;
+    `data` is the name of the data group.
     """
     tables = [details_table(scores)]
     if any(row.path_length_m is not None for row in scores):
@@ -103,7 +104,7 @@ def report_tables(data: str, scores: list[Score], seen: Seen = (), layout: Table
 
 
 def drift_table(data: str, scores: list[Score], seen: Seen = ()) -> Table:
-    """Average translation error of each method on each sequence, both averages of several, published rows where due."""
+    """Average translation error of each method on each sequence, both averages, and published rows for KITTI."""
     sequences = list(dict.fromkeys(row.sequence for row in scores))
     cells = {(row.method, row.sequence): _drift_cell(row, seen) for row in scores}
     averages = average_scores(scores)
@@ -126,7 +127,7 @@ def drift_table(data: str, scores: list[Score], seen: Seen = ()) -> Table:
 
 
 def details_table(scores: list[Score]) -> Table:
-    """Every other figure that is defined for any, one row for each method and sequence."""
+    """All other metrics that are defined for any row; one row per method and sequence."""
     columns: dict[str, Callable[[Score], str]] = {
         "method": lambda row: row.method,
         "sequence": lambda row: row.sequence,
@@ -155,7 +156,7 @@ def details_table(scores: list[Score]) -> Table:
 
 
 def _drift_cell(row: Score, seen: Seen) -> str:
-    """The percentage; where the drive is too short for it, the mean error between scans stands in, in brackets."""
+    """The percentage or, for drives too short for it, the mean error between scans in brackets."""
     star = "*" if (row.method, row.sequence) in seen else ""
     if row.avg_translation_error_percent is not None:
         return _text(row.avg_translation_error_percent, 3) + star
@@ -165,7 +166,7 @@ def _drift_cell(row: Score, seen: Seen) -> str:
 
 
 def _means(row: Averages, complete: int) -> tuple[str, str]:
-    """Both averages; those over fewer sequences than other methods have say so."""
+    """Both averages, with the number of sequences if other methods have more."""
     counted = row.mean_over_sequences.sequences
     suffix = f" ({counted} of {complete})" if 0 < counted < complete else ""
     over_sequences = row.mean_over_sequences.avg_translation_error_percent
@@ -174,7 +175,7 @@ def _means(row: Averages, complete: int) -> tuple[str, str]:
 
 
 def _reference_rows(data: str, scores: list[Score], sequences: list[str]) -> list[tuple[str, ...]]:
-    """Published rows beside whole KITTI sequences; averages only over the very sequences that are averaged here."""
+    """Published rows for whole KITTI sequences; averages only if over the same sequences as ours."""
     whole = whole_kitti_sequences(data, scores)
     averaged = list(dict.fromkeys(row.sequence for row in scores if row.segments))
     rows = []
@@ -212,7 +213,7 @@ def _drift_notes(scores: list[Score], rows: list[tuple[str, ...]], has_reference
 
 
 def protocol_markdown(protocol: Mapping[str, Any]) -> str:
-    """The last section of `results.md`: how the results came about."""
+    """The closing section of `results.md`: how the results were obtained."""
     lines = [f"- {key}: {_inline(_plain(value))}" for key, value in protocol.items()]
     return "### Protocol\n\n" + "\n".join(lines) + "\n"
 
@@ -226,7 +227,7 @@ def _text(value: float | int | None, digits: int, scale: float = 1.0) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The same in types that JSON has; floats that are not finite are not defined, hence null."""
+    """The value in types that JSON has; floats that are not finite are undefined and become null."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):

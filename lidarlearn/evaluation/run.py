@@ -1,4 +1,4 @@
-"""Run odometries over sequences and export their results; scoring reads only these files."""
+"""Run odometries over sequences and export their results. Scores are computed from these files only."""
 
 import json
 import statistics
@@ -116,17 +116,17 @@ def read_export(export: Export, sequence: Sequence) -> tuple[Float[Tensor, "n 4 
 
 
 def summarize_health(records: Iterable[Health]) -> dict[str, float | int | None]:
-    """Counts of what was flagged over a sequence, and means over the scans that were registered."""
-    every = list(records)
+    """Counts of flagged scans of a sequence, by reason, and means over the registered scans."""
+    records = list(records)
     return {
-        "flagged": sum(h.flagged for h in every),
-        "recovered": sum(h.status == "recovered" for h in every),
-        "coasted": sum(h.status in ("coasted", "restarted") for h in every),
-        "degenerate": sum(h.degenerate for h in every),
-        "implausible": sum(h.implausible for h in every),
-        "mean_iterations": _mean(h.iterations for h in every),
-        "mean_inlier_share": _mean(h.inlier_share for h in every),
-        "mean_rmse_m": _mean(h.rmse_m for h in every),
+        "flagged": sum(h.flagged for h in records),
+        "recovered": sum(h.status == "recovered" for h in records),
+        "coasted": sum(h.status in ("coasted", "restarted") for h in records),
+        "degenerate": sum(h.degenerate for h in records),
+        "implausible": sum(h.implausible for h in records),
+        "mean_iterations": _mean(h.iterations for h in records),
+        "mean_inlier_share": _mean(h.inlier_share for h in records),
+        "mean_rmse_m": _mean(h.rmse_m for h in records),
     }
 
 

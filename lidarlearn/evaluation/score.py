@@ -21,28 +21,28 @@ Number = TypeVar("Number", int, float)
 
 @dataclass(frozen=True)
 class Score:
-    """One row of `results.json`: a method on a sequence. Whatever is not defined is None, never 0.
+    """One row of `results.json`: a method on a sequence. Undefined metrics are None, never 0.
 
-    Trajectories (KITTI, APE, RPE) are compared in the frame in which the data set defines its poses, registrations
-    (relative translation error, failures) in that of the LiDAR, in which they are made.
+    Trajectories (KITTI, APE, RPE) are compared in the frame in which the data set defines its poses; registrations
+    (relative translation error, failures) in the LiDAR frame, in which they are made.
 
     Args:
-        method: as in the paper, e.g. "cv+p_f2m".
+        method: name of the method as in the paper, e.g. "cv+p_f2m".
         sequence: name of the sequence.
         frames: number of scans.
-        path_length_m: of the ground truth.
+        path_length_m: length of the true path [m].
         segments: number of KITTI's segments of 100 to 800 m.
-        avg_translation_error_percent: their mean translation error; what the paper calls ATE.
-        avg_rotation_error_deg_per_100m: their mean rotation error.
-        ape_rmse_m: absolute pose error after rigid alignment, root mean square.
-        rpe_translation_m: relative pose error of consecutive scans, root mean square.
-        rpe_translation_mean_m: the same, mean.
-        rpe_rotation_deg: its angle, root mean square.
-        relative_translation_error_percent: mean error of the motion between scans as a share of the mean motion.
-        registration_failures: motions between scans that are off by more than 1 m or 3 deg.
-        frames_per_second: of the odometry; None for trajectories of other tools.
+        avg_translation_error_percent: mean translation error of the segments, which the paper calls ATE [%].
+        avg_rotation_error_deg_per_100m: mean rotation error of the segments [deg/100 m].
+        ape_rmse_m: absolute pose error after rigid alignment, root mean square [m].
+        rpe_translation_m: relative pose error between consecutive scans, root mean square [m].
+        rpe_translation_mean_m: the same, mean [m].
+        rpe_rotation_deg: angle of the relative pose error, root mean square [deg].
+        relative_translation_error_percent: mean error of the motion between scans, relative to the mean motion [%].
+        registration_failures: number of motions between scans with an error of more than 1 m or 3 deg.
+        frames_per_second: speed of the odometry; None for trajectories of other tools.
         by_segment_length: mean errors over KITTI's segments of each length [m].
-        health: what the odometry says about itself, as means over the sequence.
+        health: summary of the odometry's health records.
     """
 
     method: str
@@ -65,13 +65,13 @@ class Score:
 
 @dataclass(frozen=True)
 class MeanOverSequences:
-    """Means of a method's scores in which every sequence counts the same, however long.
+    """Means of a method's scores, with the same weight for every sequence.
 
     Args:
-        sequences: how many sequences have KITTI's segments; only they are in the two averages of KITTI's metric.
+        sequences: number of sequences with KITTI segments, over which the two averages of KITTI's metric are taken.
         registration_failures: the sum over the sequences.
 
-    The other figures are those of `Score`, each a mean over the sequences for which it is defined.
+    The other fields are those of `Score`, each averaged over the sequences for which it is defined.
     """
 
     sequences: int
@@ -88,7 +88,7 @@ class MeanOverSequences:
 
 @dataclass(frozen=True)
 class MeanOverSegments:
-    """KITTI's metric over the segments of all sequences pooled, as the benchmark's own table has it."""
+    """KITTI's metric over the pooled segments of all sequences, as in the benchmark's own table."""
 
     segments: int
     avg_translation_error_percent: float | None
@@ -97,7 +97,7 @@ class MeanOverSegments:
 
 @dataclass(frozen=True)
 class Averages:
-    """The two averages of a method that are in use, and often mixed up."""
+    """Both averages of a method: publications use either, and they are often confused."""
 
     method: str
     mean_over_sequences: MeanOverSequences
@@ -111,19 +111,19 @@ def score(
     frames_per_second: float | None = None,
     health: Mapping[str, float | int | None] | None = None,
 ) -> Score:
-    """Score the poses that a method gave for a sequence; every error is None where there is no ground truth.
+    """Score the estimated poses of a method on a sequence. Without ground truth, every error is None.
 
     Args:
         method: name of the method.
-        T_world_lidar: its absolute poses of the LiDAR, one a scan; the first one may be any.
+        T_world_lidar: absolute poses of the LiDAR, one per scan; the first one is arbitrary.
         sequence: the sequence, with its ground truth; no scan is read.
-        frames_per_second: how fast the method was.
-        health: summary of what the odometry says about itself.
+        frames_per_second: speed of the method.
+        health: summary of the odometry's health records.
 
     Raises:
-        TrajectoryError: the number of poses is not that of the scans, or a pose is not finite.
+        TrajectoryError: the numbers of poses and scans differ, or a pose is not finite.
     """
-    _check(method, T_world_lidar, sequence)
+    _require_scorable(method, T_world_lidar, sequence)
     T_true = sequence.T_world_lidar
     if T_true is None:
         return Score(
@@ -156,7 +156,7 @@ def score(
 
 
 def average_scores(scores: Iterable[Score]) -> list[Averages]:
-    """Both averages of every method, in the order in which methods first appear."""
+    """Both averages of every method, in order of first appearance."""
     by_method: dict[str, list[Score]] = {}
     for row in scores:
         by_method.setdefault(row.method, []).append(row)
@@ -164,20 +164,22 @@ def average_scores(scores: Iterable[Score]) -> list[Averages]:
 
 
 def pool_by_length(scores: list[Score]) -> dict[int, SegmentAverage]:
-    """Mean errors over the segments of each length [m], those of all sequences pooled."""
-    pooled = {}
-    for length in sorted({length for row in scores for length in row.by_segment_length}):
-        parts = [row.by_segment_length[length] for row in scores if length in row.by_segment_length]
-        count = sum(part.segments for part in parts)
-        pooled[length] = SegmentAverage(
-            segments=count,
-            translation_percent=sum(part.segments * part.translation_percent for part in parts) / count,
-            rotation_deg_per_100m=sum(part.segments * part.rotation_deg_per_100m for part in parts) / count,
-        )
-    return pooled
+    """Mean errors by segment length [m], over the pooled segments of all sequences."""
+    lengths = sorted({length for row in scores for length in row.by_segment_length})
+    return {n: _pool([row.by_segment_length[n] for row in scores if n in row.by_segment_length]) for n in lengths}
 
 
-def _check(method: str, T_world_lidar: Tensor, sequence: Sequence) -> None:
+def _pool(parts: list[SegmentAverage]) -> SegmentAverage:
+    """The mean errors over all segments behind several averages."""
+    count = sum(part.segments for part in parts)
+    return SegmentAverage(
+        segments=count,
+        translation_percent=sum(part.segments * part.translation_percent for part in parts) / count,
+        rotation_deg_per_100m=sum(part.segments * part.rotation_deg_per_100m for part in parts) / count,
+    )
+
+
+def _require_scorable(method: str, T_world_lidar: Tensor, sequence: Sequence) -> None:
     where = f"'{method}' on sequence {sequence.name}"
     if len(T_world_lidar) != len(sequence):
         raise TrajectoryError(
@@ -212,15 +214,11 @@ def _over_sequences(rows: list[Score]) -> MeanOverSequences:
 
 
 def _over_segments(rows: list[Score]) -> MeanOverSegments:
-    pooled = list(pool_by_length(rows).values())
-    count = sum(part.segments for part in pooled)
-    if not count:
+    by_length = pool_by_length(rows)
+    if not by_length:
         return MeanOverSegments(0, None, None)
-    return MeanOverSegments(
-        segments=count,
-        avg_translation_error_percent=sum(part.segments * part.translation_percent for part in pooled) / count,
-        avg_rotation_error_deg_per_100m=sum(part.segments * part.rotation_deg_per_100m for part in pooled) / count,
-    )
+    pooled = _pool(list(by_length.values()))
+    return MeanOverSegments(pooled.segments, pooled.translation_percent, pooled.rotation_deg_per_100m)
 
 
 def _defined(values: Iterable[Number | None]) -> list[Number]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from lidarlearn.data.sequence import Sequence
 from lidarlearn.evaluation.run import Export
 
-# Scans in each sequence of the KITTI odometry benchmark whose ground truth is kept by the server.
+# Number of scans in each sequence of the KITTI odometry benchmark whose ground truth only the server has.
 KITTI_TEST_FRAMES = {
     "11": 921,
     "12": 1061,
@@ -24,17 +24,17 @@ KITTI_TEST_FRAMES = {
 
 
 def is_kitti_test_set(sequences: Iterable[Sequence]) -> bool:
-    """Whether all of 11 to 21 are among the sequences, whole, with poses in the frame of the left camera."""
+    """Whether the sequences include all of 11 to 21, whole and with poses of the left camera."""
     frames = {sequence.name: len(sequence) for sequence in sequences if sequence.reference_frame == "camera"}
     return KITTI_TEST_FRAMES.items() <= frames.items()
 
 
 def write_submission(path: Path, trajectories: Path) -> Path:
-    """Pack 11.txt to 21.txt, one pose of the left camera a row, side by side as the server wants them.
+    """Pack 11.txt to 21.txt, with one pose of the left camera per row, into a zip file without folders.
 
     Args:
         path: the zip file to write.
-        trajectories: folder of a method's exported trajectories.
+        trajectories: a method's folder of exported trajectories.
 
     Returns:
         The zip file.

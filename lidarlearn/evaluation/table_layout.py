@@ -1,4 +1,4 @@
-"""A table as a paper sets it: groups of sequences as columns, one figure, published values below."""
+"""Tables as in a paper: a column for each group of sequences, one metric, published values below."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -16,18 +16,18 @@ _FIGURES = {
 
 @dataclass(frozen=True)
 class TableLayout:
-    """How the sequences of an experiment are summed up.
+    """The layout of an experiment's table.
 
     Args:
         title: what is compared, and in which table of which paper.
-        columns: names of sequences by the heading that they share.
-        figure: what each cell shows, a field of `MeanOverSequences`: the mean over the column's sequences, or the sum
-            where it is a number of failures.
-        published: what others report for a row, in the order of the columns; None where they report nothing.
+        columns: headings of the columns, with the names of their sequences.
+        figure: the metric in the cells, a field of `MeanOverSequences`: its mean over the sequences of the column, or
+            the sum of failures.
+        published: values reported by others, by method and in the order of the columns; None where not reported.
         source: where the published values come from, and on which data.
 
     Raises:
-        ValueError: the figure is none of those that a table can show, or a published row has another length.
+        ValueError: a table cannot show the metric, or a published row does not match the columns.
     """
 
     title: str
@@ -44,10 +44,10 @@ class TableLayout:
                 raise ValueError(f"table.published.{method}: {len(values)} values for {len(self.columns)} columns")
 
     def table(self, scores: list[Score], seen: Collection[tuple[str, str]] = ()) -> Table:
-        """The table of what was measured.
+        """The table of measured scores.
 
         Args:
-            scores: of all methods on all sequences.
+            scores: scores of all methods on all sequences.
             seen: methods and sequences on which their networks were trained.
         """
         what, digits = _FIGURES[self.figure]

@@ -8,21 +8,21 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-_LEGIBLE = 4  # letters of a folded heading or label that a line has at least
+_LEGIBLE = 4  # fewest letters in a line of a folded heading or label
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of finished text.
+    """A table whose cells are text.
 
     Args:
-        title: what the figures are, with their unit.
-        columns: headings; the first `labels` of them name the rows.
-        rows: cells, as many as there are columns.
-        reference: rows to compare with that were not measured here, set apart below the others.
-        notes: one line each, below the table.
-        labels: number of columns that name a row, set flush left.
-        lowest: columns whose lowest figure among `rows` is set in bold; cells that say more than a figure stay out.
+        title: what the table shows, with the unit.
+        columns: headings of the columns.
+        rows: the cells of each row, one per column.
+        reference: rows to compare with, which were not measured here; shown below the others.
+        notes: lines below the table.
+        labels: number of leading columns that name the row; they are left-aligned.
+        lowest: columns whose lowest number in `rows` is bold; cells with more than a number are ignored.
     """
 
     title: str
@@ -34,7 +34,7 @@ class Table:
     lowest: frozenset[int] = field(default_factory=frozenset)
 
     def markdown(self) -> str:
-        """The table in GitHub's Markdown, columns aligned for reading as plain text too."""
+        """The table in GitHub's Markdown, with aligned columns, so that it also reads as plain text."""
         best = self._lowest()
         bold = [tuple(f"**{c}**" if c == best.get(i) else c for i, c in enumerate(row)) for row in self.rows]
         lines = [tuple(cell.replace("|", "\\|") for cell in row) for row in (self.columns, *bold, *self.reference)]
@@ -44,15 +44,15 @@ class Table:
         return f"### {self.title}\n\n{text}\n" + "".join(f"\n{note}\n" for note in self.notes)
 
     def print(self, console: Console) -> None:
-        """Print it to a terminal; columns that find no room beside the others come below them, labels repeated."""
-        console.print(Text(self.title, "bold"))  # not the table's own title, which folds with a narrow table
+        """Print to a terminal; columns that do not fit beside the others come below, with the labels repeated."""
+        console.print(Text(self.title, "bold"))  # a `RichTable.title` would be folded to the width of the table
         for block in self._blocks(console.width):
-            console.print(block._set_for(console.width))
+            console.print(block._rich_table(console.width))
         for note in self.notes:
             console.print(Text(note, "dim"))
 
-    def _set_for(self, available: int) -> RichTable:
-        """All columns as the terminal takes them."""
+    def _rich_table(self, available: int) -> RichTable:
+        """All columns, for a terminal of this width."""
         widths = self._widths(available)
         roomy = sum(widths) + 2 * len(widths) < available
         table = RichTable(box=SIMPLE_HEAD, padding=(0, int(roomy), 0, 0))
@@ -69,20 +69,20 @@ class Table:
         return table
 
     def _lowest(self) -> dict[int, str]:
-        """The cell of the lowest figure in each chosen column that has several."""
+        """The cell with the lowest number in each column of `lowest` that has different numbers."""
         best = {}
         for i in self.lowest:
-            figures = {row[i]: value for row in self.rows if (value := _figure(row[i])) is not None}
-            if len(figures) > 1:
-                best[i] = min(figures, key=lambda cell: figures[cell])
+            numbers = {row[i]: value for row in self.rows if (value := _number(row[i])) is not None}
+            if len(numbers) > 1:
+                best[i] = min(numbers, key=lambda cell: numbers[cell])
         return best
 
     def _headings(self) -> list[str]:
-        """Headings for narrow columns: a word a line above figures."""
+        """Headings for narrow columns: one word per line, except above labels."""
         return [c if i < self.labels else c.replace(" ", "\n") for i, c in enumerate(self.columns)]
 
     def _blocks(self, available: int) -> list["Table"]:
-        """The whole table where no figure has to fold, else as many columns at a time as fit beside the labels."""
+        """The whole table if no number must fold; else tables of as many columns as fit beside the labels."""
         widest, least = self._extents()
         if sum(least) + len(least) + 1 <= available:
             return [self]
@@ -95,9 +95,9 @@ class Table:
                 room = beside_labels
             chosen[-1].append(i)
             room -= widest[i] + 1
-        return [self._only(columns) for columns in chosen]
+        return [self._with_columns(columns) for columns in chosen]
 
-    def _only(self, chosen: list[int]) -> "Table":
+    def _with_columns(self, chosen: list[int]) -> "Table":
         return replace(
             self,
             columns=tuple(self.columns[i] for i in chosen),
@@ -107,7 +107,7 @@ class Table:
         )
 
     def _extents(self) -> tuple[list[int], list[int]]:
-        """Width of each column at which nothing folds, and that at which labels and headings do, but no figure."""
+        """The widths of the columns at which nothing folds, and those at which only labels and headings fold."""
         widest, least = [], []
         for i, heading in enumerate(self._headings()):
             own = max((len(row[i]) for row in self.rows), default=1)
@@ -118,9 +118,9 @@ class Table:
         return widest, least
 
     def _widths(self, available: int) -> list[int]:
-        """Width of each column in a terminal: where it is narrow labels and headings fold, but no method or figure."""
+        """The widths of the columns in a terminal: if narrow, labels and headings fold, but no method or number."""
         widths, least = self._extents()
-        excess = sum(widths) + len(widths) + 1 - available  # a space around each
+        excess = sum(widths) + len(widths) + 1 - available  # with a space on either side of each column
         for i in sorted(range(len(widths)), key=lambda i: least[i] - widths[i]):
             cut = max(0, min(excess, widths[i] - least[i]))
             widths[i] -= cut
@@ -132,7 +132,7 @@ class Table:
         return [cell.ljust(w) if i < self.labels else cell.rjust(w) for i, (cell, w) in enumerate(pairs)]
 
 
-def _figure(cell: str) -> float | None:
+def _number(cell: str) -> float | None:
     try:
         return float(cell)
     except ValueError:

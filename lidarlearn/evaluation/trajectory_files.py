@@ -1,4 +1,4 @@
-"""Find and read trajectory files in KITTI's and TUM's format, and convert the frame that their poses are in."""
+"""Find and read trajectory files in KITTI's and TUM's formats, and convert their poses between frames."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,8 +14,8 @@ from lidarlearn.metrics.relative import relative_translation_error
 
 _KITTI_COLUMNS = 12
 _TUM_COLUMNS = 8
-_FAR_BETTER = 1 / 3  # of the errors, for poses to look like those of another frame
-_MAX_DEVIATION = 1e-2  # of R R^T from the identity; some tools write three digits
+_FAR_BETTER = 1 / 3  # poses are taken for those of another frame if their error there is less than this share
+_MAX_DEVIATION = 1e-2  # of R R^T from the identity; some tools write only three digits
 
 
 class TrajectoryError(UserError):
@@ -25,20 +25,20 @@ class TrajectoryError(UserError):
 def read_trajectory(
     path: Path, timestamps: Float[Tensor, "m"] | None = None, tolerance_s: float = 0.01
 ) -> Float[Tensor, "n 4 4"]:
-    """Read poses from a file in KITTI's or TUM's format, told apart by the number of columns.
+    """Read poses from a file in KITTI's or TUM's format, recognized by the number of columns.
 
     Args:
-        path: the file; blank lines and what follows a # are skipped.
-        timestamps: of the scans [s]. Each takes the pose of a TUM file that is nearest in time, others are left out;
-            where there are none the rows are taken as they stand.
-        tolerance_s: largest accepted distance in time between a scan and its pose.
+        path: the file; blank lines and comments after a # are skipped.
+        timestamps: times of the scans [s]. For each scan, the pose nearest in time is taken from a TUM file, and other
+            poses are ignored; None takes every row.
+        tolerance_s: largest accepted time difference between a scan and its pose.
 
     Returns:
-        Absolute poses, float64, in the file's own frame; matrices as they stand in the file.
+        Absolute poses, float64, in the file's own frame; matrices are not orthonormalized.
 
     Raises:
-        TrajectoryError: the file is missing, in another format, or leaves a scan without a pose.
-        DamagedFileError: a row of it is malformed.
+        TrajectoryError: the file is missing, in another format, or has no pose for a scan.
+        DamagedFileError: a row is malformed.
     """
     columns = _columns(path)
     if columns == _KITTI_COLUMNS:
@@ -59,17 +59,17 @@ def read_trajectory(
 def lidar_poses(
     T_world: Float[Tensor, "n 4 4"], stated: str | None, sequence: Sequence, path: Path
 ) -> Float[Tensor, "n 4 4"]:
-    """Poses of the LiDAR from those of a file.
+    """Convert the poses of a file to poses of the LiDAR.
 
     Args:
-        T_world: the file's poses.
-        stated: the frame that they are said to be in; None takes the frame in which the data set gives its own poses,
-            which is also that of our exports, unless they fit the ground truth far better as poses of the LiDAR.
-        sequence: what they are of.
+        T_world: poses in the file.
+        stated: their frame, as stated by the user; None assumes the frame of the data set's own poses, in which our
+            trajectories are exported as well.
+        sequence: the sequence to which they belong.
         path: the file.
 
     Raises:
-        TrajectoryError: nothing is stated, and they look like poses of the LiDAR.
+        TrajectoryError: no frame is stated, and they fit the ground truth far better as poses of the LiDAR.
     """
     reference = sequence.reference_frame
     T_world_lidar = to_lidar_frame(T_world, stated or reference, reference, sequence.T_reference_lidar)
@@ -78,9 +78,9 @@ def lidar_poses(
         as_stated, as_lidar = (relative_translation_error(T, T_true) for T in (T_world_lidar, T_world))
         if as_stated is not None and as_lidar is not None and as_lidar < _FAR_BETTER * as_stated:
             raise TrajectoryError(
-                f"{path.absolute()}: the motions are {100 * as_stated:.0f} % off as poses of the {reference}, in which "
-                f"this data set gives its own, {100 * as_lidar:.0f} % as poses of the LiDAR.\n"
-                f"  change: trajectories_frame=lidar, or trajectories_frame={reference} if they are what they should be"
+                f"{path.absolute()}: the motions are {100 * as_stated:.0f} % off as poses of the {reference}, the "
+                f"frame of this data set's own poses, but {100 * as_lidar:.0f} % as poses of the LiDAR.\n"
+                f"  change: trajectories_frame=lidar, or trajectories_frame={reference} if that is right nevertheless"
             )
     return T_world_lidar
 
@@ -88,16 +88,16 @@ def lidar_poses(
 def to_lidar_frame(
     T_world: Float[Tensor, "n 4 4"], frame: str, reference_frame: str, T_reference_lidar: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "n 4 4"]:
-    """Poses of the LiDAR from poses of the frame that a trajectory file is said to be in.
+    """Convert poses of another frame to poses of the LiDAR.
 
     Args:
-        T_world: absolute poses of `frame`, relative to its own first pose or to any other.
-        frame: "camera" or "lidar", as stated by whoever made the file.
-        reference_frame: the frame of the data set's own poses, as in `Sequence.reference_frame`.
-        T_reference_lidar: from the LiDAR to it, as in `Sequence.T_reference_lidar`.
+        T_world: absolute poses of `frame`; the first one is arbitrary.
+        frame: e.g. "camera" or "lidar".
+        reference_frame: the frame of the data set's own poses, see `Sequence.reference_frame`.
+        T_reference_lidar: pose of the LiDAR in that frame, see `Sequence.T_reference_lidar`.
 
     Raises:
-        TrajectoryError: the data set does not say where the stated frame is.
+        TrajectoryError: the data set does not define the frame.
     """
     if frame == "lidar":
         return T_world
@@ -112,24 +112,24 @@ def to_lidar_frame(
 def to_reference_frame(
     T_world_lidar: Float[Tensor, "n 4 4"], T_reference_lidar: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "n 4 4"]:
-    """Poses of the data set's reference frame from those of the LiDAR: T_cam = Tr T_velo Tr^-1 for KITTI.
+    """Convert poses of the LiDAR to poses of the data set's reference frame; for KITTI, T_cam = Tr T_velo Tr^-1.
 
-    The inverse is that of a general matrix, as Tr in KITTI's calibration is a rotation to seven digits only.
+    The inverse is that of a general matrix: the rotation in KITTI's Tr is accurate to seven digits only.
     """
     return T_reference_lidar @ T_world_lidar @ torch.linalg.inv(T_reference_lidar)
 
 
 def find_trajectories(path: Path, sequences: list[str]) -> dict[str, dict[str, Path]]:
-    """Trajectory files of any tool, by method and sequence.
+    """Find trajectory files of any tool, by method and sequence.
 
     Args:
-        path: a file (for one sequence), a folder of `<sequence>.txt` or `.tum`, a folder of such folders, one for each
-            method, or an evaluation's run folder, which holds the last. A method is called as its folder; a single
-            file's as the file unless that is the sequence.
+        path: a file (for one sequence), a folder of `<sequence>.txt` or `.tum` files, a folder with one such folder per
+            method, or the run folder of an evaluation. Methods are named after their folders; the method of a single
+            file after the file, unless this is named after the sequence.
         sequences: names of all sequences to be scored.
 
     Raises:
-        TrajectoryError: nothing is there, or a method lacks a sequence.
+        TrajectoryError: there are no trajectories, or a method lacks a sequence.
     """
     if path.is_file():
         if len(sequences) != 1:
@@ -168,18 +168,13 @@ def _candidates(path: Path) -> Iterator[Path]:
 
 
 def _in_folder(folder: Path, sequences: list[str]) -> dict[str, Path]:
-    """The file of each sequence that has one; .txt goes before .tum."""
-    files = {}
-    for name in sequences:
-        for path in (folder / f"{name}.txt", folder / f"{name}.tum"):
-            if path.is_file():
-                files[name] = path
-                break
-    return files
+    """The file of each sequence that has one; a .txt takes precedence over a .tum."""
+    candidates = ((name, folder / f"{name}{suffix}") for name in sequences for suffix in (".tum", ".txt"))
+    return {name: path for name, path in candidates if path.is_file()}
 
 
 def _columns(path: Path) -> int:
-    """Numbers in the first row of a trajectory file, which tell the format."""
+    """The number of columns in the first row of a trajectory file; 0 if there is none."""
     if not path.is_file():
         raise TrajectoryError(f"{path.absolute()}: no such trajectory.\n  change: trajectories=PATH")
     with path.open(encoding="utf-8", errors="replace") as file:
@@ -191,7 +186,7 @@ def _columns(path: Path) -> int:
 
 
 def _require_rotations(path: Path, T_world: Float[Tensor, "n 4 4"]) -> None:
-    """Refuse matrices that are no motions, as columns in another order would make them."""
+    """Raise a `TrajectoryError` if a matrix is no rotation, e.g. because the columns have another order."""
     R = T_world[:, :3, :3]
     deviation = (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs().amax((1, 2))
     bad = (deviation > _MAX_DEVIATION) | (torch.linalg.det(R) < 0)
@@ -210,7 +205,7 @@ def _short(R: Float[Tensor, "3 3"]) -> str:
 def _match(
     path: Path, times: Float[Tensor, "n"], timestamps: Float[Tensor, "m"], tolerance_s: float
 ) -> Int[Tensor, "m"]:
-    """Index of the pose nearest in time to each scan."""
+    """Index of the nearest pose in time for each scan."""
     after = torch.searchsorted(times, timestamps).clamp(max=len(times) - 1)
     before = (after - 1).clamp(min=0)
     nearest = torch.where((times[after] - timestamps).abs() < (timestamps - times[before]).abs(), after, before)
