@@ -1,4 +1,4 @@
-"""Buildings with windows set back into their walls, bays, balconies, steps and roofs, so that facades have relief."""
+"""Buildings with recessed windows, bays, balconies, steps and roofs, so that facades have relief."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from lidarlearn.simulation.objects import at
 
 
 def building(rng: np.random.Generator, length: float, depth: float, height: float) -> Mesh:
-    """A house on the origin, its front (with bays, balconies and a door) towards -y.
+    """A house centred at the origin, with its front (bay windows, balconies and a door) towards -y.
 
     Args:
-        rng: of its details.
+        rng: random generator of the details.
         length: extent along x [m].
         depth: extent along y [m].
-        height: of the eaves [m].
+        height: height of the eaves [m].
     """
     floors = max(1, round(height / 3.0))
     recess, bay = rng.uniform(0.12, 0.4), rng.uniform(2.4, 4.0)
@@ -32,7 +32,7 @@ def building(rng: np.random.Generator, length: float, depth: float, height: floa
 
 
 def hall(rng: np.random.Generator, length: float, depth: float, height: float) -> Mesh:
-    """A plain hall with pilasters: workshops, sports halls, supermarkets."""
+    """A plain hall with pilasters, such as a workshop, a sports hall or a supermarket."""
     spacing = rng.uniform(4, 7)
     xs = np.arange(-length / 2 + 0.3, length / 2, spacing)
     pilasters = [at(box(0.5, depth + 0.7, height), x=x) for x in xs]
@@ -41,7 +41,7 @@ def hall(rng: np.random.Generator, length: float, depth: float, height: float) -
 
 
 def _facade(width: float, height: float, bays: int, floors: int, recess: float, window: tuple[float, float]) -> Mesh:
-    """A wall in the x-z plane, windows sunk by `recess` towards +y; `window` is their share of a cell (x, z)."""
+    """A wall in the x-z plane with windows set back by `recess` towards +y; `window` is their share of a cell."""
     cell = _window_cell(recess, window)
     cell_width, cell_height = width / bays, height / floors
     column, floor = np.meshgrid(np.arange(bays), np.arange(floors))
@@ -52,7 +52,7 @@ def _facade(width: float, height: float, bays: int, floors: int, recess: float, 
 
 
 def _window_cell(recess: float, window: tuple[float, float]) -> Mesh:
-    """A piece of wall of unit size around one window: frame, reveals and pane."""
+    """A unit-sized piece of wall around one window: frame, reveals and pane."""
     half, low, high = window[0] / 2, 0.25, 0.25 + window[1]
     square = np.array([[-0.5, 0.0], [0.5, 0.0], [0.5, 1.0], [-0.5, 1.0]])
     inner = np.array([[-half, low], [half, low], [half, high], [-half, high]])
@@ -82,7 +82,7 @@ def _roof(rng: np.random.Generator, length: float, depth: float, height: float) 
 
 
 def _front(rng: np.random.Generator, length: float, depth: float, height: float, floors: int) -> list[Mesh]:
-    """What sticks out of a front: steps and a porch, bay windows, balconies, gutters."""
+    """The projecting parts of a front: gutters, steps, a porch, a bay window, balconies."""
     parts = [at(cylinder(0.06, height, 6), x=side * (length / 2 - 0.3), y=-depth / 2 - 0.08) for side in (-1, 1)]
     door = rng.uniform(-0.35, 0.35) * length
     parts.append(at(box(1.8, 1.0, 0.35), x=door, y=-depth / 2 - 0.5))

@@ -1,4 +1,4 @@
-"""A simulated drive: scans in memory, straight from a few settings."""
+"""A simulated drive, whose scans are made in memory from a few settings."""
 
 import hashlib
 from collections.abc import Iterator
@@ -23,23 +23,23 @@ from lidarlearn.source_digest import source_digest
 
 _SIMULATOR = Path(__file__).resolve().parent
 
-# Each source of chance has a stream of its own, so that e.g. a static drive takes the way of the lively one.
+# Each source of randomness has its own stream, so that e.g. a drive takes the same route with and without traffic.
 _TERRAIN, _MOTION, _WORLD, _SCAN = range(4)
 
 
 class Drive(Sequence):
-    """A drive through a simulated world. Scans are made when asked for; each depends on the settings alone.
+    """A drive through a simulated world. Scans are made on request; each depends on the settings alone.
 
     Args:
-        world: "urban", "highway", "campus", "segway", or a world that was built already (then `poses` are needed).
-        seed: of everything left to chance; same seed, same bytes.
+        world: "urban", "highway", "campus", "segway", or an existing world, which needs `poses`.
+        seed: seed of everything random; the same seed gives the same bytes.
         frames: number of scans.
-        sensor: None for the one that belongs to the world.
-        speed: constant speed from the first scan on [m/s]; None drives as one does there.
+        sensor: the sensor; None takes the usual one of the world.
+        speed: constant speed [m/s]; None varies it as is usual in the world.
         static: leave out everything that moves.
-        motion_distortion: cast every column from its own pose, and give times with the points.
-        poses: the sensor's path, `T_world_lidar` once per scan [m]; None makes one. Scenery is built around it.
-        name: of the sequence.
+        motion_distortion: cast every column from its own pose, and give scans the times of their points.
+        poses: path of the sensor, `T_world_lidar` once per scan [m], around which the scenery is built; None makes one.
+        name: name of the sequence; None takes that of the world and the seed.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Drive(Sequence):
         self.sensor = self._place.sensor() if sensor is None else sensor
         self.frames = frames if poses is None else min(frames, len(poses))
         self.name = f"{self.world_name}_{seed:02d}" if name is None else name
-        # Scenery goes on beyond the last scan, but not along the whole of a long file.
+        # The scenery continues beyond the last scan, but not along all of a long file.
         self._given = None if poses is None else np.asarray(poses[: frames + 100], dtype=np.float64)
         self._own = world if isinstance(world, World) else None
         self.timestamps = torch.arange(self.frames, dtype=torch.float64) * self.sensor.period
@@ -77,7 +77,7 @@ class Drive(Sequence):
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the settings and of the simulator's code: changed, it may give other scans for the same settings."""
+        """Hash of the settings and of the simulator's code, since other code may make other scans."""
         settings = [simulator_digest(), self.world_name, self.seed, self.frames, sorted(asdict(self.sensor).items())]
         settings += [self.speed, self.static, self.motion_distortion]
         digest = hashlib.sha256(repr(settings).encode())
@@ -89,20 +89,20 @@ class Drive(Sequence):
         return digest.hexdigest()[:16]
 
     def __getstate__(self) -> dict[str, object]:
-        """Without what Open3D holds and what can be made anew."""
+        """The state without Open3D's scene and the world, which are rebuilt on demand."""
         return {key: value for key, value in self.__dict__.items() if key not in ("_caster", "world")}
 
     def build(self) -> None:
-        """Build the world at once, not with the first scan: from then on several threads may make scans."""
-        self._caster.cast(np.ones((1, 6), dtype=np.float32))  # Open3D completes a scene when it is first cast into
+        """Build the world now instead of with the first scan. From then on, several threads may make scans."""
+        self._caster.cast(np.ones((1, 6), dtype=np.float32))  # Open3D completes a scene with the first cast
 
     def scan(self, index: int) -> Scan:
-        """Simulate one scan; its times are given when it is distorted by motion."""
+        """Simulate one scan; it has times if it is distorted by motion."""
         points, times = self.sensor.points(self.ranges(index), index)
         return Scan(torch.from_numpy(points), torch.from_numpy(times) if self.motion_distortion else None)
 
     def ranges(self, index: int) -> UInt16[np.ndarray, "beams columns"]:
-        """The range image of one scan as the sensor reports it, in steps of `sensors.RANGE_STEP`."""
+        """The range image that the sensor reports for one scan, in steps of `sensors.RANGE_STEP`."""
         if not 0 <= index < self.frames:
             raise IndexError(f"{self.name} has scans 0 to {self.frames - 1}, asked for {index}")
         distances, cos_incidence = self._cast(index)
@@ -110,7 +110,7 @@ class Drive(Sequence):
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """The sensor's trajectory in the map frame, where the world is built."""
+        """The sensor's trajectory in the map frame, in which the world is built."""
         return self._motion[0]
 
     @cached_property
@@ -162,7 +162,7 @@ class Drive(Sequence):
         return distances, cosines
 
     def _cast_movers(self, index: int, rays: np.ndarray, distances: np.ndarray, cosines: np.ndarray) -> None:
-        """Put what moves in front of what does not, in place: only columns that may see it are cast again."""
+        """Add moving things in front of static ones, in place. Only columns that may see them are cast again."""
         sensor = self.sensor
         sectors = 12 if self.motion_distortion else 1
         for sector in np.array_split(np.arange(sensor.columns), sectors):
@@ -185,12 +185,12 @@ class Drive(Sequence):
 
 
 def simulator_digest() -> str:
-    """Hash of the code that scans depend on: this module and those of the simulator that it uses."""
+    """Hash of the code on which scans depend: this module and the modules of the simulator that it uses."""
     return source_digest(Path(__file__), within=_SIMULATOR)
 
 
 def _arrays(world: World) -> Iterator[np.ndarray]:
-    """All that a world consists of."""
+    """All arrays of a world."""
     for mesh in (world.static, *(mover.mesh for mover in world.movers)):
         yield from (mesh.vertices, mesh.triangles)
     for mover in world.movers:
@@ -200,12 +200,12 @@ def _arrays(world: World) -> Iterator[np.ndarray]:
 def _seen(
     vertices: Float[np.ndarray, "n 3"], pose: Float[np.ndarray, "4 4"], azimuths: Float[np.ndarray, "columns"]
 ) -> Bool[np.ndarray, "columns"]:
-    """Which azimuths may meet a body: from its least to its greatest bearing, all where the sensor lies within it.
+    """Which azimuths may hit a body: those between its least and greatest bearing, or all if the sensor is inside.
 
-    The ends have 4 degrees to spare, 30 where they are nearer than 6 m: columns are cast from poses of their own.
+    Bearings get a margin of 4 degrees, or of 30 degrees within 6 m, because each column is cast from its own pose.
     """
     xy = ((vertices - pose[:3, 3]) @ pose[:3, :3])[:, :2]
-    middle = np.arctan2(*xy.mean(axis=0)[::-1])  # within the body: all that is seen of it lies about this bearing
+    middle = np.arctan2(*xy.mean(axis=0)[::-1])  # towards the inside of the body; bearings are relative to it
     bearings = (np.arctan2(xy[:, 1], xy[:, 0]) - middle + np.pi) % (2 * np.pi) - np.pi
     if np.ptp(bearings) >= np.pi:
         return np.ones(len(azimuths), dtype=bool)

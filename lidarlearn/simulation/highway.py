@@ -1,4 +1,4 @@
-"""Scenery of a motorway: little of it."""
+"""The sparse scenery of a motorway."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from lidarlearn.simulation.site import Site, Street
 
 
 def furnish_highway(site: Site) -> None:
-    """Guard rails here and there, reflector posts, signs, bridges, trees and bushes on the banks, noise barriers."""
+    """Guard rails, reflector posts, signs, lamps, bridges, trees and bushes on the banks, noise barriers."""
     road = site.streets[0]
     _rails(site, road, 0.0, share=0.8)  # the central reserve
     for side in (-1, 1):
@@ -26,7 +26,7 @@ def furnish_highway(site: Site) -> None:
 
 
 def _rails(site: Site, road: Street, offset: float, share: float) -> None:
-    """A guard rail on posts along parts of the road."""
+    """Build a guard rail on posts along parts of the road."""
     line = road.offset(offset)
     start = 0
     while start < len(line) - 10:
@@ -40,7 +40,7 @@ def _rails(site: Site, road: Street, offset: float, share: float) -> None:
 
 
 def _barriers(site: Site, road: Street, side: int) -> None:
-    """A noise barrier of posts and panels along a short part of the road, or none."""
+    """Build a noise barrier of posts and panels along a short part of the road, or none."""
     rng = site.rng
     if rng.random() < 0.5:
         length = int(rng.uniform(60, 150))
@@ -53,7 +53,7 @@ def _barriers(site: Site, road: Street, side: int) -> None:
 
 
 def _across(site: Site, road: Street) -> None:
-    """Bridges and gantries over the road."""
+    """Build bridges and gantries over the road."""
     rng = site.rng
     along, _ = road.frames()
     place = rng.uniform(60, 160)
@@ -73,7 +73,7 @@ def _across(site: Site, road: Street) -> None:
 
 
 def _woods(site: Site) -> None:
-    """Clumps of trees and bushes on the banks, open fields in between."""
+    """Plant clumps of trees and bushes on the banks, with open fields in between."""
     rng = site.rng
     trees = [objects.tree(rng) for _ in range(4)] + [objects.conifer(rng) for _ in range(2)]
     area = float(np.prod(site.high - site.low))

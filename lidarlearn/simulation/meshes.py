@@ -9,10 +9,10 @@ from jaxtyping import Float, Int
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles that rays can hit from both sides.
+    """Triangles that rays hit from either side.
 
     Args:
-        vertices: corners [m].
+        vertices: corners of the triangles [m].
         triangles: indices of each triangle's corners.
     """
 
@@ -30,7 +30,7 @@ def empty() -> Mesh:
 
 
 def merge(meshes: Iterable[Mesh]) -> Mesh:
-    """The union of meshes as one."""
+    """The union of several meshes."""
     parts = list(meshes) or [empty()]
     counts = np.array([len(part.vertices) for part in parts])
     starts = np.cumsum(counts) - counts
@@ -62,7 +62,7 @@ def box(length: float, width: float, height: float, base: float = 0.0) -> Mesh:
 
 
 def cylinder(radius: float, height: float, sides: int = 8, top_radius: float | None = None, base: float = 0.0) -> Mesh:
-    """A closed upright prism with regular `sides`, tapering to `top_radius`, its lower face at z = `base`."""
+    """A closed upright prism over a regular polygon at z = `base`, tapering to `top_radius`."""
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     top = radius if top_radius is None else top_radius
@@ -81,9 +81,9 @@ def extruded(outline: Float[np.ndarray, "n 2"], width: float, top_width: float |
     """A body with the given outline in the x-z plane, symmetric in y.
 
     Args:
-        outline: corners (x, z), star-shaped about their mean.
+        outline: corners (x, z) of an outline that is star-shaped about their mean [m].
         width: extent in y at the lowest corner [m].
-        top_width: extent in y at the highest corner, in between linear [m]; None for `width`.
+        top_width: extent in y at the highest corner, with linear interpolation in between [m]; None takes `width`.
     """
     n = len(outline)
     low, high = outline[:, 1].min(), outline[:, 1].max()
@@ -102,10 +102,10 @@ def extruded(outline: Float[np.ndarray, "n 2"], width: float, top_width: float |
 
 
 def leaves(rng: np.random.Generator, count: int, radii: tuple[float, float, float], leaf: float) -> Mesh:
-    """A porous ellipsoid of scattered triangles, denser towards its surface, centred at the origin: foliage.
+    """Foliage: a porous ellipsoid of scattered triangles, denser towards its surface, centred at the origin.
 
     Args:
-        rng: where the leaves sit.
+        rng: random generator of the leaves.
         count: number of triangles.
         radii: semi-axes of the ellipsoid [m].
         leaf: size of a triangle [m].
@@ -118,7 +118,7 @@ def leaves(rng: np.random.Generator, count: int, radii: tuple[float, float, floa
 
 
 def ribbon(points: Float[np.ndarray, "n 3"], height: float, base: float = 0.0) -> Mesh:
-    """An upright sheet without thickness along a line of points, from `base` to `base + height` above them."""
+    """An upright sheet without thickness along a line of points, from `base` to `base + height` above the line."""
     n = len(points)
     up = np.array([0, 0, 1.0])
     i = np.arange(n - 1)
@@ -130,8 +130,8 @@ def sheet(points: Float[np.ndarray, "rows columns 3"], keep: np.ndarray | None =
     """A surface through a grid of points.
 
     Args:
-        points: the grid.
-        keep: which of its (rows - 1) x (columns - 1) cells are there; None for all.
+        points: the grid [m].
+        keep: which of its (rows - 1) x (columns - 1) cells to keep; None keeps all.
     """
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)

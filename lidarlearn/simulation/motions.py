@@ -1,4 +1,4 @@
-"""Ways of moving: a car in town or on a motorway, a Segway on a campus."""
+"""Motions of vehicles: cars in town, on a campus or on a motorway, and a Segway."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,27 +12,27 @@ from lidarlearn.simulation.trajectories import PlanarMotion, extended
 
 _TIME_STEP = 0.05
 _ARC_STEP = 0.5
-_SCENERY_AHEAD = 120.0  # the world goes on beyond both ends of the drive [m]
+_SCENERY_AHEAD = 120.0  # length of the world beyond either end of the drive [m]
 _MAX_YAW_RATE = 0.68  # 39 deg/s; KITTI's cars turn by up to 40
 
 
 @dataclass(frozen=True)
 class Driving:
-    """The style of a drive; pairs are (least, greatest) of what is drawn afresh for each stretch of road.
+    """The style of a drive. Pairs are the least and greatest of values drawn at random along the road.
 
     Args:
         cruise: speed on a straight road [m/s].
         straight: length between two bends [m].
         turn_share: share of the bends that are turns into another road.
         turn_deg: angle of such a turn [deg].
-        turn_radius: its radius [m].
+        turn_radius: radius of such a turn [m].
         bend_deg: angle of any other bend [deg].
-        bend_radius: its radius [m].
-        acceleration: when pulling away and, times 1.3, when braking [m/s^2].
-        lateral: acceleration in bends that the driver stands [m/s^2].
-        stretch: length over which one cruising speed is kept [m].
+        bend_radius: radius of any other bend [m].
+        acceleration: largest acceleration; brakes reach 1.3 times as much [m/s^2].
+        lateral: largest lateral acceleration in bends [m/s^2].
+        stretch: length of road with the same cruising speed [m].
         stop_share: share of the turns before which the car stops.
-        sway_deg: slow wandering within the lane, as heading [deg].
+        sway_deg: standard deviation of the heading due to slow wandering within the lane [deg].
     """
 
     cruise: tuple[float, float]
@@ -86,14 +86,14 @@ HIGHWAY = Driving(
 def drive(
     rng: np.random.Generator, driving: Driving, start: float, duration: float, speed: float | None = None
 ) -> PlanarMotion:
-    """A car's drive, in motion from the first instant.
+    """The drive of a car, which moves from the first instant on.
 
     Args:
-        rng: of route and speeds.
-        driving: the style.
+        rng: random generator of the route and the speeds.
+        driving: the style of the drive.
         start: first time [s].
-        duration: of the drive [s].
-        speed: constant speed [m/s], which widens turns to what it allows; None varies it with road and style.
+        duration: duration of the drive [s].
+        speed: constant speed, for which turns are widened as needed [m/s]; None varies it with the road and the style.
     """
     times = start + _TIME_STEP * np.arange(int(np.ceil(duration / _TIME_STEP)) + 1)
     reach = duration * (driving.cruise[1] if speed is None else speed) + _SCENERY_AHEAD + 10
@@ -115,7 +115,7 @@ def drive(
 def _route(
     rng: np.random.Generator, driving: Driving, before: float, reach: float, speed: float | None
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], list[tuple[float, float]]]:
-    """Curvature [1/m] and cruising speed [m/s] along a way, and stops as (place [m], duration [s]); 0 is the start."""
+    """Curvature [1/m] and speed limit [m/s] along a route, and stops as (place [m], duration [s]); 0 is the start."""
     smallest = 0.0 if speed is None else max(speed**2 / driving.lateral, speed / (0.8 * _MAX_YAW_RATE))
     curvature = [np.zeros(int(before / _ARC_STEP))]
     stops: list[tuple[float, float]] = []
@@ -124,7 +124,7 @@ def _route(
     while place < reach:
         turn = rng.random() < driving.turn_share
         angle = np.radians(rng.uniform(*(driving.turn_deg if turn else driving.bend_deg)))
-        # Never far round: a route that keeps its general direction does not run into itself.
+        # Turn back before turning too far: a route that keeps its general direction does not cross itself.
         sign = -np.sign(turned) if abs(turned) > 0.8 else rng.choice([-1.0, 1.0])
         radius = max(rng.uniform(*(driving.turn_radius if turn else driving.bend_radius)), smallest)
         if turn and rng.random() < driving.stop_share:
@@ -144,7 +144,7 @@ def _route(
 
 
 def _drivable(limit: Float[np.ndarray, "n"], driving: Driving) -> Float[np.ndarray, "n"]:
-    """The highest speed below `limit` that a car reaches with its acceleration and brakes."""
+    """The highest speed below `limit` that the acceleration and the brakes of the car allow."""
     speed = limit.copy()
     for i in range(1, len(speed)):
         speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + 2 * driving.acceleration * _ARC_STEP))
@@ -159,7 +159,7 @@ def _speed_over_time(
     speed: Float[np.ndarray, "k"],
     stops: list[tuple[float, float]],
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Way covered [m] and speed [m/s] at `times` from speeds over the way, with stops, without jerks."""
+    """Distance covered [m] and speed [m/s] at `times`, from speeds along the route and stops, without jerks."""
     nodes = s[: len(speed)]
     for place, _ in stops:
         if place > 25:  # the drive starts in motion
@@ -168,7 +168,7 @@ def _speed_over_time(
     for place, dwell in stops:
         clock = clock + dwell * (nodes > place) * (place > 25)
     clock = clock - np.interp(0.0, nodes, clock)
-    padding = 40  # so that smoothing sees beyond both ends
+    padding = 40  # so that smoothing has values beyond either end
     fine = np.concatenate([times[0] + _TIME_STEP * np.arange(-padding, 0), times])
     fine = np.concatenate([fine, times[-1] + _TIME_STEP * np.arange(1, padding + 1)])
     pace = np.gradient(np.interp(fine, clock, nodes), _TIME_STEP)
@@ -186,12 +186,12 @@ def _smooth_interp(
 
 
 def segway(rng: np.random.Generator, start: float, duration: float, speed: float | None = None) -> PlanarMotion:
-    """A Segway's run: at most 1.5 m/s, jerks of yaw, pitch swinging by several degrees as it balances.
+    """The run of a Segway: at most 1.5 m/s, with abrupt yaw and a pitch that swings by several degrees as it balances.
 
     Args:
-        rng: of the run.
+        rng: random generator of the run.
         start: first time [s].
-        duration: of the run [s].
+        duration: duration of the run [s].
         speed: constant speed [m/s]; None varies it.
     """
     times = start + _TIME_STEP * np.arange(int(np.ceil(duration / _TIME_STEP)) + 1)
@@ -205,7 +205,7 @@ def segway(rng: np.random.Generator, start: float, duration: float, speed: float
         centre = moment + rng.uniform(-0.8, 0.8)
         jerks += angle * np.exp(-0.5 * ((times - centre) / width) ** 2) / (width * np.sqrt(2 * np.pi))
     heading = np.cumsum(turning + jerks) * _TIME_STEP
-    heading -= 0.6 * (heading - gaussian_filter1d(heading, 8 / _TIME_STEP))  # it has somewhere to go
+    heading -= 0.6 * (heading - gaussian_filter1d(heading, 8 / _TIME_STEP))  # keeps a general direction
     velocity = pace[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     xy = np.concatenate([np.zeros((1, 2)), np.cumsum((velocity[1:] + velocity[:-1]) / 2 * _TIME_STEP, axis=0)])
     sway = gaussian_filter1d(rng.normal(size=len(times) + 80), 0.22 / _TIME_STEP)[40:-40]
@@ -220,7 +220,7 @@ def _held(
     draw: Callable[[], float],
     width: float,
 ) -> Float[np.ndarray, "n"]:
-    """Values drawn one after another, each held for `hold` [s], with smooth changes of `width` [s] in between."""
+    """Values drawn one after another, each held for a time within `hold` [s]; changes are smoothed over `width` [s]."""
     values = np.empty(len(times))
     filled = 0
     while filled < len(values):

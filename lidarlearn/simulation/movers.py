@@ -1,4 +1,4 @@
-"""Cars and people that move while the sensor drives by."""
+"""Cars and people that move."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ class Mover:
     """Something that moves along a line.
 
     Args:
-        mesh: standing on the origin, facing x.
-        lane: points of the line on the ground [m].
-        times: at which its way is given [s].
-        way: arc length covered along the lane at these times [m]; off either end it is not there.
+        mesh: its shape, standing at the origin and facing x.
+        lane: points of the line, on the ground [m].
+        times: times at which `way` is given [s].
+        way: arc length along the lane at these times [m]; beyond either end of the lane it is absent.
     """
 
     mesh: Mesh
@@ -31,7 +31,7 @@ class Mover:
         return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(self.lane, axis=0), axis=1))])
 
     def position(self, time: float, ahead: float = 0.0) -> Float[np.ndarray, "3"] | None:
-        """Where it stands at a time [s], or the point `ahead` of that on its lane [m]; None where it is not there."""
+        """Its position at a time [s], or the point `ahead` of it on the lane [m]; None while it is absent."""
         end = self._arc_length[-1]
         here = np.interp(time, self.times, self.way)
         if not 0 <= here <= end:
@@ -40,7 +40,7 @@ class Mover:
         return np.array([np.interp(place, self._arc_length, self.lane[:, k]) for k in range(3)])
 
     def at(self, time: float) -> Mesh | None:
-        """Its mesh where it is at a time [s]; None where it is not in the world then."""
+        """Its mesh at its position at a time [s]; None while it is absent."""
         centre, back, front = (self.position(time, ahead) for ahead in (0.0, -1.0, 1.0))
         if centre is None or back is None or front is None:
             return None

@@ -1,4 +1,4 @@
-"""What stands, hangs, is parked or moves in a simulated world. Every mesh stands on z = 0 at the origin, facing x."""
+"""Objects of the simulated worlds. Every mesh stands at the origin on z = 0 and faces x."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ def at(mesh: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 
 
 
 def car(rng: np.random.Generator) -> Mesh:
-    """A saloon, an estate car or a hatchback."""
+    """A passenger car."""
     length, width, height = rng.uniform(3.8, 4.8), rng.uniform(1.7, 1.9), rng.uniform(1.4, 1.6)
     rear, bonnet = -length / 2, length / 2
     belt = 0.62 * height
@@ -33,7 +33,7 @@ def van(rng: np.random.Generator) -> Mesh:
 
 
 def lorry(rng: np.random.Generator) -> Mesh:
-    """A lorry with its box body."""
+    """A lorry with a box body."""
     length = rng.uniform(8, 14)
     cab = at(box(2.2, 2.4, 2.6, base=0.5), x=length / 2 - 1.1)
     body = at(box(length - 2.6, 2.5, 2.8, base=1.0), x=-1.3)
@@ -61,7 +61,7 @@ def pedestrian(rng: np.random.Generator) -> Mesh:
 
 
 def tree(rng: np.random.Generator, height: float | None = None) -> Mesh:
-    """A broad-leaved tree: trunk, a few boughs, a porous crown."""
+    """A broad-leaved tree: a trunk and a porous crown."""
     height = rng.uniform(5, 12) if height is None else height
     radius = 0.025 * height
     trunk = cylinder(radius, 0.6 * height, 7, top_radius=0.6 * radius)
@@ -74,7 +74,7 @@ def tree(rng: np.random.Generator, height: float | None = None) -> Mesh:
 
 
 def conifer(rng: np.random.Generator) -> Mesh:
-    """A spruce: storeys of foliage down to near the ground."""
+    """A spruce: layers of foliage almost down to the ground."""
     height = rng.uniform(6, 14)
     storeys = []
     for share in np.linspace(0.15, 0.9, 6):
@@ -106,20 +106,20 @@ def lamp(rng: np.random.Generator) -> Mesh:
 
 
 def sign(rng: np.random.Generator) -> Mesh:
-    """A traffic sign, its board across x."""
+    """A traffic sign whose board faces x."""
     size, height = rng.uniform(0.5, 0.9), rng.uniform(2.0, 2.5)
     return merge([cylinder(0.04, height + size, 5), at(box(0.03, size, size, base=height), x=0.06)])
 
 
 def road_sign(rng: np.random.Generator) -> Mesh:
-    """A large motorway sign on two posts, its board across x."""
+    """A large motorway sign on two posts whose board faces x."""
     width, height = rng.uniform(2.5, 5), rng.uniform(1.5, 3)
     posts = [at(cylinder(0.08, 2.0 + height, 6), y=side * width / 3) for side in (-1, 1)]
     return merge([*posts, at(box(0.06, width, height, base=2.0), x=0.1)])
 
 
 def gantry(rng: np.random.Generator, span: float) -> Mesh:
-    """A sign gantry over a carriageway, `span` metres across x, centred."""
+    """A sign gantry over a carriageway along x, `span` metres wide."""
     posts = [at(box(0.4, 0.4, 6.5), y=side * span / 2) for side in (-1, 1)]
     boards = [at(box(0.15, 3.5, 2.2, base=5.4), y=y) for y in (-0.22 * span, 0.22 * span)]
     return merge([*posts, box(0.5, span, 0.6, base=6.2), *boards])
@@ -150,7 +150,7 @@ def wall(rng: np.random.Generator, length: float) -> Mesh:
 
 
 def fence(rng: np.random.Generator, length: float) -> Mesh:
-    """A fence of pales along x."""
+    """A picket fence along x."""
     height, spacing = rng.uniform(0.9, 1.6), rng.uniform(0.25, 0.5)
     xs = np.arange(-length / 2, length / 2, spacing)
     positions = np.column_stack([xs, np.zeros((len(xs), 2))])

@@ -1,4 +1,4 @@
-"""Ray casting with Open3D. The only module that imports it, when the first rays are cast."""
+"""Ray casting with Open3D, which only this module imports, and only when needed."""
 
 import ctypes
 import functools
@@ -13,11 +13,11 @@ from lidarlearn.simulation.meshes import Mesh
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays met first.
+    """The first surfaces that rays hit.
 
     Args:
-        distances: along each ray, in units of its direction's length; infinite where it met nothing.
-        normals: unit normal of the surface that was met, of either sign; zero where it met nothing.
+        distances: distance along each ray, in units of the length of its direction; infinite if it hits nothing.
+        normals: unit normal of the surface, of either sign; zero if the ray hits nothing.
     """
 
     distances: Float[np.ndarray, "n"]
@@ -25,7 +25,7 @@ class Hits:
 
 
 class RayCaster:
-    """Casts rays against a mesh that does not change.
+    """Casts rays against a fixed mesh.
 
     Args:
         mesh: the surfaces.
@@ -40,20 +40,20 @@ class RayCaster:
         self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
 
     def cast(self, rays: Float32[np.ndarray, "n 6"]) -> Hits:
-        """The first surface on each ray, given as origin and direction."""
+        """Find the first surface on each ray, which is given by its origin and direction."""
         answer = self._scene.cast_rays(self._tensor.from_numpy(rays))
         return Hits(answer["t_hit"].numpy(), answer["primitive_normals"].numpy())
 
 
 @functools.cache
 def _open3d() -> ModuleType:
-    """Import Open3D. It links to the system's libusb-1.0, which a bare machine lacks: a wheel carries it instead."""
+    """Import Open3D, which links to libusb-1.0. Systems without this library get it from a wheel."""
     try:
         import libusb_package
 
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError):
-        pass  # the system's own libusb may do
+        pass  # the system may have a libusb
     import open3d
 
     return open3d

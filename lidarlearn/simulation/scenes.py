@@ -1,6 +1,6 @@
-"""Small closed-form worlds to test registration and odometry on, with paths through them.
+"""Small geometric worlds for tests of registration and odometry, and paths through them.
 
-The sensor rides 1.73 m above the floor z = 0 along x; `Drive(scene, poses=straight_path(...))` makes scans of them.
+The sensor moves along x, 1.73 m above the floor z = 0. `Drive(scene, poses=straight_path(...))` makes the scans.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ def straight_path(frames: int, step: float, start: float = 0.0, yaw_step: float 
 
 
 def room(length: float = 20.0, width: float = 14.0, height: float = 4.0) -> World:
-    """A closed room around the origin with a few boxes in it: every direction is constrained."""
+    """A closed room around the origin with a few boxes in it, which constrains motion in every direction."""
     furniture = [
         objects.at(box(2.0, 1.0, 1.2), 5.0, 3.0, 0.0, 0.4),
         objects.at(box(1.0, 3.0, 2.0), -6.0, -4.0, 0.0, -0.3),
@@ -37,13 +37,13 @@ def room(length: float = 20.0, width: float = 14.0, height: float = 4.0) -> Worl
 
 
 def corridor(width: float = 8.0, height: float = 6.0, length: float = 1000.0) -> World:
-    """Floor and two walls, all plane and endless: the motion along x cannot be seen."""
+    """An endless floor and two endless plane walls, which do not constrain motion along x."""
     walls = [objects.at(box(length, 0.2, height), y=side * (width / 2 + 0.1)) for side in (-1, 1)]
     return World(merge([box(length, 4 * width, 1.0, base=-1.0), *walls]))
 
 
 def tunnel(radius: float = 5.0, length: float = 1000.0) -> World:
-    """A round bore with a flat floor, endless: the motion along x cannot be seen."""
+    """An endless round tunnel with a flat floor, which does not constrain motion along x."""
     angle = np.linspace(0, np.pi, 65)
     arch = np.stack([0 * angle, radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     ends = np.array([[-length / 2, 0, 0], [length / 2, 0, 0]])
@@ -51,7 +51,7 @@ def tunnel(radius: float = 5.0, length: float = 1000.0) -> World:
 
 
 def street(seed: int = 0, length: float = 200.0) -> World:
-    """A straight street with houses, trees, poles and parked cars on a plane, from x = -50 on."""
+    """A straight street on a plane, from x = -50 on, with houses, trees, lamps and parked cars."""
     rng = np.random.default_rng(seed)
     parts: list[Mesh] = [objects.at(box(length + 200, 200.0, 1.0, base=-1.0), x=length / 2 - 50)]
     for side in (-1, 1):

@@ -1,4 +1,4 @@
-"""Spinning LiDARs: where their rays point, and what their electronics make of the true distances."""
+"""Spinning LiDARs: the directions of their rays, and how they measure true distances."""
 
 import math
 from dataclasses import dataclass
@@ -14,20 +14,20 @@ _GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 @dataclass(frozen=True)
 class Sensor:
-    """A spinning LiDAR. Image rows are beams from top to bottom, columns azimuths from the rear over the left side.
+    """A spinning LiDAR. Rows of its images are beams from top to bottom, columns azimuths from the rear over the left.
 
     Args:
-        name: of the model.
+        name: name of the model.
         elevations_deg: angle of each beam above the horizon, the highest first [deg].
         columns: firings per revolution.
-        period: of a revolution [s].
-        min_range: nearest distance it reports [m].
-        max_range: farthest distance it reports [m], at most 131 m.
-        range_noise: standard deviation of a distance [m].
+        period: duration of a revolution [s].
+        min_range: nearest reported distance [m].
+        max_range: farthest reported distance [m], at most 131 m.
+        range_noise: standard deviation of the distances [m].
         drop_out: share of the returns lost at random.
         reach: distance at which half of the returns from a surface hit at a right angle are lost [m]. The signal
-            falls with the square of the distance and the cosine of the angle of incidence, so that roads fade out
-            long before walls do; infinity switches this off.
+            falls with the square of the distance and with the cosine of the angle of incidence, so that roads fade
+            out long before walls do. Infinity switches this off.
     """
 
     name: str
@@ -54,13 +54,13 @@ class Sensor:
         return len(self.elevations_deg)
 
     def column_times(self) -> Float[np.ndarray, "columns"]:
-        """When each column is fired, as a share of the period relative to the middle of the sweep: [-0.5, 0.5)."""
+        """Time of each column relative to the middle of the sweep, in periods: [-0.5, 0.5)."""
         return np.arange(self.columns) / self.columns - 0.5
 
     def azimuths(self, index: int) -> Float[np.ndarray, "columns"]:
-        """Azimuth of each column of scan `index` [rad], falling from pi (the rear) over 0 (forward) to -pi.
+        """Azimuth of each column of scan `index` [rad], decreasing from pi (rear) over 0 (forward) to -pi.
 
-        The firings are not locked to the revolution: from scan to scan they shift by a fraction of a column.
+        The firings are not synchronized with the revolution: from scan to scan they shift by a fraction of a column.
         """
         shift = (index / _GOLDEN_RATIO) % 1
         return math.pi - 2 * math.pi * (np.arange(self.columns) + shift) / self.columns
@@ -82,12 +82,12 @@ class Sensor:
         cos_incidence: Float[np.ndarray, "beams columns"],
         rng: np.random.Generator,
     ) -> UInt16[np.ndarray, "beams columns"]:
-        """The range image that is reported: true distances with noise, drop-out and limits.
+        """The reported range image: true distances with noise, drop-out and limits of the range.
 
         Args:
-            distances: to the first surface on each ray [m], infinite where there is none.
-            cos_incidence: cosine of the angle between ray and surface normal.
-            rng: of the noise and the drop-out.
+            distances: distance to the first surface on each ray [m]; infinite if there is none.
+            cos_incidence: cosine of the angle between the ray and the normal of the surface.
+            rng: random generator of the noise and the drop-out.
 
         Returns:
             Ranges in steps of `RANGE_STEP`, 0 where nothing came back.
@@ -98,7 +98,7 @@ class Sensor:
         ranges = np.where(keep, distances, 0) + np.float32(self.range_noise) * noise
         keep &= (ranges >= self.min_range) & (ranges <= self.max_range)
         lost, fading = np.float32(self.drop_out), ranges * ranges * np.float32(1 / self.reach**2)
-        # chance >= drop_out + (1 - drop_out) / (1 + signal) with signal = cos_incidence / fading, undivided
+        # chance >= drop_out + (1 - drop_out) / (1 + signal) with signal = cos_incidence / fading, without divisions
         keep &= (chance - lost) * (cos_incidence + fading) >= np.float32(1 - self.drop_out) * fading
         steps = np.where(keep, ranges, 0) * np.float32(1 / RANGE_STEP) + np.float32(0.5)
         return steps.astype(np.uint16)
@@ -106,9 +106,9 @@ class Sensor:
     def points(
         self, ranges: UInt16[np.ndarray, "beams columns"], index: int
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-        """Points in the sensor frame, float32 [m], and their times, beam after beam as in KITTI's files.
+        """Points in float32 [m] and their times in periods, see `column_times`, ordered by beam as in KITTI's files.
 
-        Each point lies in the frame that the sensor had when it was fired.
+        Each point is in the frame of the sensor at the time of its firing.
         """
         hit = ranges > 0
         points = self.directions(index)[hit] * (ranges[hit] * np.float32(RANGE_STEP))[:, None]
@@ -117,7 +117,7 @@ class Sensor:
 
 
 def hdl64(columns: int = 2000) -> Sensor:
-    """Velodyne HDL-64E, 32 beams 1/3 deg apart above 32 beams 1/2 deg apart.
+    """Velodyne HDL-64E: 32 beams 1/3 deg apart above 32 beams 1/2 deg apart.
 
     Source: HDL-64E manual (+2 to -24.33 deg); KITTI's scans show the same two blocks.
     """

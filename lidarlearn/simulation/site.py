@@ -1,4 +1,4 @@
-"""Where scenery may stand: streets, the ground around them, and what has been built already."""
+"""The site of a world: streets, the ground around them, and everything built on it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ class Street:
     """A road or a footway.
 
     Args:
-        centreline: points about 1 m apart [m].
-        half_width: of the carriageway [m].
+        centreline: points of the centreline, about 1 m apart [m].
+        half_width: half the width of the carriageway [m].
     """
 
     centreline: Float[np.ndarray, "n 2"]
@@ -36,13 +36,13 @@ class Street:
 
 @dataclass(frozen=True)
 class Profile:
-    """The cross-section of a street and what lies beside it.
+    """The cross-section of a street and of the ground beside it.
 
     Args:
-        kerb: step up at the edge of the carriageway [m], negative for a shoulder that falls off.
-        bank: height of hillocks and cuttings beside the road, both up and down [m].
-        bank_start: distance from the edge of the carriageway where they begin [m].
-        roughness: of the ground off the road [m].
+        kerb: step up at the edge of the carriageway [m]; negative for a shoulder that falls off.
+        bank: height of the banks beside the road, which rise and fall [m].
+        bank_start: distance from the edge of the carriageway to the banks [m].
+        roughness: standard deviation of the height of the ground off the road [m].
     """
 
     kerb: float
@@ -53,7 +53,7 @@ class Profile:
 
 @dataclass(frozen=True)
 class Spot:
-    """A place beside a street: position, direction along the street and towards it [rad]."""
+    """A place beside a street: its position [m], the direction of the street and the direction towards it [rad]."""
 
     xy: Float[np.ndarray, "2"]
     along: float
@@ -61,16 +61,16 @@ class Spot:
 
 
 class Site:
-    """A piece of land with streets on which a world is built.
+    """Land with streets, on which a world is built.
 
     Args:
-        rng: of all that is placed by chance.
+        rng: random generator of everything placed at random.
         terrain: the smooth ground.
-        streets: all roads; the first is the one that is driven.
-        profile: their cross-section.
+        streets: all streets; the drive follows the first one.
+        profile: cross-section of the streets.
     """
 
-    _CELL = 0.5  # of the raster of occupied ground [m]
+    _CELL = 0.5  # edge of a cell of the grid of occupied ground [m]
 
     def __init__(self, rng: np.random.Generator, terrain: Terrain, streets: list[Street], profile: Profile) -> None:
         self.rng, self.terrain, self.streets, self.profile = rng, terrain, streets, profile
@@ -84,12 +84,12 @@ class Site:
         self._meshes: list[Mesh] = []
 
     def beside(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Distance from the edge of the nearest carriageway [m], negative on it."""
+        """Distance from the edge of the nearest carriageway [m]; negative on the carriageway."""
         distance, nearest = self._tree.query(xy)
         return distance - self._widths[nearest]
 
     def ground(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Height of the ground with kerbs and banks [m]."""
+        """Height of the ground including kerbs and banks [m]."""
         return self.terrain.height(xy) + self._relief(xy, self.beside(xy))
 
     def _relief(self, xy: Float[np.ndarray, "n 2"], beside: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -99,14 +99,14 @@ class Site:
         return kerb + self.profile.bank * rise * rise * (3 - 2 * rise) * (0.35 + wave)
 
     def ground_mesh(self, cell: float = 0.6, coarse: float = 5.0, width: float = 7.0) -> Mesh:
-        """The ground: fine up to `width` beside the streets, where kerbs are, coarse elsewhere."""
+        """The ground: fine on the streets and up to `width` beside them, because of the kerbs; coarse elsewhere."""
         fine = self._surface(cell, -np.inf, width, 0.0)
-        # Coarse triangles reach below the fine ones, so that no ray slips through between the two.
+        # Coarse triangles continue below the fine ones, so that no ray passes between them.
         rest = self._surface(coarse, width - 1.5 * coarse, np.inf, 0.08)
         return merge([fine, rest])
 
     def _surface(self, cell: float, nearest: float, farthest: float, sunk: float) -> Mesh:
-        """The ground whose distance from the edge of a street lies in between, lowered by `sunk` near streets."""
+        """The ground within a range of distances from the edge of a street, lowered by `sunk` near the streets."""
         axes = [np.arange(self.low[k], self.high[k], cell) for k in (0, 1)]
         xy = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         reach = farthest + self._widths.max()
@@ -137,13 +137,13 @@ class Site:
     def place(
         self, mesh: Mesh, xy: Float[np.ndarray, "2"], yaw: float, size: tuple[float, float], clearance: float
     ) -> bool:
-        """Build something if its ground is free.
+        """Build an object if the ground is free.
 
         Args:
-            mesh: what to build.
-            xy: where its origin comes.
-            yaw: how it is turned [rad].
-            size: extent of its footprint along its own x and y [m].
+            mesh: the object.
+            xy: position of its origin [m].
+            yaw: rotation about z [rad].
+            size: extent of its footprint along its own x and y axes [m].
             clearance: least distance from the edge of any carriageway [m].
 
         Returns:
@@ -159,17 +159,17 @@ class Site:
         return True
 
     def add(self, mesh: Mesh, xy: Float[np.ndarray, "2"], yaw: float) -> None:
-        """Build something without asking."""
+        """Build an object whether or not the ground is free."""
         self._meshes.append(mesh.moved(np.array([*xy, self.ground(xy[None])[0]]), yaw))
 
     def add_world(self, mesh: Mesh) -> None:
-        """Build something whose vertices are in the world frame already."""
+        """Build an object whose vertices are in the world frame."""
         self._meshes.append(mesh)
 
     def scatter(
         self, mesh: Mesh, xy: Float[np.ndarray, "n 2"], scales: Float[np.ndarray, "n"], clearance: float
     ) -> None:
-        """Copies of one thing at many places, except where something stands or a road is near."""
+        """Build copies of an object, except on occupied ground or closer than `clearance` [m] to a carriageway."""
         cells = np.floor((xy - self.low) / self._CELL).astype(int)
         cells = cells.clip(0, np.array(self._occupied.shape) - 1)
         free = (self.beside(xy) > clearance) & ~self._occupied[cells[:, 0], cells[:, 1]]
@@ -180,7 +180,7 @@ class Site:
             self._meshes.append(instances(mesh, positions, yaws, np.repeat(scales[:, None], 3, axis=1)))
 
     def _footprint(self, xy: np.ndarray, yaw: float, size: tuple[float, float]) -> np.ndarray | None:
-        """Cells of the raster below a turned rectangle; None where it leaves the site."""
+        """Grid cells below a rotated rectangle; None if it is not entirely on the site."""
         x, y = (np.linspace(-extent / 2, extent / 2, int(extent / self._CELL) + 2) for extent in size)
         x, y = (axis.ravel() for axis in np.meshgrid(x, y))
         turned = np.stack([np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y], axis=-1)
@@ -189,5 +189,5 @@ class Site:
         return None if outside else cells
 
     def mesh(self) -> Mesh:
-        """All that was built, and the ground."""
+        """Everything built, and the ground."""
         return merge([*self._meshes, self.ground_mesh()])

@@ -1,4 +1,4 @@
-"""The height of the ground: gentle slopes that a vehicle follows."""
+"""The height of the ground, whose gentle slopes a vehicle follows."""
 
 from abc import ABC, abstractmethod
 
@@ -16,18 +16,18 @@ class Terrain(ABC):
 
 
 class Hills(Terrain):
-    """A sum of waves of 30 to 300 m with random directions: closed form, without bounds.
+    """A sum of waves of 30 to 300 m in random directions, defined everywhere.
 
     Args:
-        rng: of the waves.
-        slope_deg: root mean square of the slope along any direction [deg]; KITTI's roads have 1 to 3.
+        rng: random generator of the waves.
+        slope_deg: root mean square of the slope in any direction [deg]; 1 to 3 on KITTI's roads.
     """
 
     def __init__(self, rng: np.random.Generator, slope_deg: float) -> None:
         count = 8
         lengths = np.geomspace(30, 300, count)
         heading = rng.uniform(0, 2 * np.pi, count)
-        # Long waves carry most of the slope: short ones would shake the vehicle.
+        # Long waves carry most of the slope, because short ones would shake the vehicle.
         share = (lengths / lengths.sum()) ** 0.5
         slopes = np.tan(np.radians(slope_deg)) * 2 * share / np.linalg.norm(share)
         self._wave = 2 * np.pi / lengths * np.stack([np.cos(heading), np.sin(heading)])
@@ -40,15 +40,15 @@ class Hills(Terrain):
 
 
 class GroundBelow(Terrain):
-    """The smooth ground below a given path.
+    """Smooth ground below a given path.
 
     Args:
-        points: of the ground, where the path touches it [m].
+        points: points of the path on the ground [m].
     """
 
     _CELL = 4.0
     _MARGIN = 250.0
-    # Near the path its own heights count; farther away wider and wider averages take over.
+    # Near the path, its own heights dominate; farther away, averages over wider and wider areas.
     _SIGMAS_AND_WEIGHTS = ((6.0, 1.0), (40.0, 1e-3), (200.0, 1e-6))
 
     def __init__(self, points: Float[np.ndarray, "n 3"]) -> None:

@@ -1,4 +1,4 @@
-"""Sensor trajectories in continuous time: a planar motion laid onto the ground, or any given poses."""
+"""Sensor trajectories in continuous time, from a planar motion on the ground or from given poses."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,15 +19,15 @@ _R_LIDAR_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """How a vehicle moves on a map.
+    """The motion of a vehicle on a map.
 
     Args:
-        times: of the samples, evenly spaced [s].
-        xy: position of the vehicle's reference point [m].
-        heading: direction in which it faces [rad], continuous.
-        speed: along its heading [m/s].
-        sway: pitch on top of what ground and acceleration cause, nose down positive [rad].
-        track: the way in space, from well before the first position to well beyond the last [m].
+        times: times of the samples, evenly spaced [s].
+        xy: position of the reference point of the vehicle [m].
+        heading: direction of the vehicle, without jumps of 2 pi [rad].
+        speed: speed along the heading [m/s].
+        sway: pitch in addition to that due to ground and acceleration, positive with the nose down [rad].
+        track: the path, from well before the first position to well beyond the last [m].
     """
 
     times: Float[np.ndarray, "n"]
@@ -40,15 +40,15 @@ class PlanarMotion:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What carries the sensor.
+    """The vehicle that carries the sensor.
 
     Args:
-        sensor_height: above the ground [m].
-        sensor_forward: of the reference point, which moves where it faces (the rear axle) [m].
-        wheelbase: distance of the axles, over which the ground is felt [m].
-        gauge: distance of left and right wheels [m].
-        squat: pitch per forward acceleration, nose up [rad per m/s^2].
-        lean: roll per lateral acceleration, outwards [rad per m/s^2].
+        sensor_height: height of the sensor above the ground [m].
+        sensor_forward: distance of the sensor in front of the reference point on the rear axle [m].
+        wheelbase: distance between the axles [m].
+        gauge: distance between left and right wheels [m].
+        squat: pitch with the nose up, per forward acceleration [rad per m/s^2].
+        lean: outward roll, per lateral acceleration [rad per m/s^2].
     """
 
     sensor_height: float = 1.73
@@ -63,7 +63,7 @@ class Trajectory:
     """Sensor poses at any time, smooth in between.
 
     Args:
-        times: of the given poses, increasing [s].
+        times: times of the given poses, increasing [s].
         poses: `T_world_lidar` at these times.
     """
 
@@ -73,7 +73,7 @@ class Trajectory:
         self._rotation = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
 
     def at(self, times: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 4 4"]:
-        """`T_world_lidar` at the given times, which may lie a scan's length outside of the given ones."""
+        """`T_world_lidar` at any times, up to one period of the sensor before or after those of the given poses."""
         poses = np.tile(np.eye(4), (len(times), 1, 1))
         poses[:, :3, :3] = self._rotation(times).as_matrix()
         poses[:, :3, 3] = self._position(times)
@@ -81,9 +81,9 @@ class Trajectory:
 
 
 def on_ground(motion: PlanarMotion, terrain: Terrain, vehicle: Vehicle) -> Trajectory:
-    """The sensor's trajectory on a vehicle whose pitch and roll follow the ground below its four wheels.
+    """The trajectory of the sensor on a vehicle whose pitch and roll follow the ground below its four wheels.
 
-    Springs tilt it further under acceleration. Nothing jitters: ground and motion are smooth at the vehicle's scale.
+    Acceleration tilts it further. Nothing jitters: ground and motion are smooth at the scale of the vehicle.
     """
     forward = np.stack([np.cos(motion.heading), np.sin(motion.heading)], axis=-1)
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
@@ -111,8 +111,8 @@ def read_poses(path: Path, camera: bool) -> Float[np.ndarray, "n 4 4"]:
 
     Args:
         path: the file.
-        camera: whether it holds poses of KITTI's left camera, as the odometry benchmark publishes them; their axes
-            are turned into the LiDAR's, the lever arm between the two is left out.
+        camera: whether the poses are those of KITTI's left camera, as published for the odometry benchmark. Their axes
+            are rotated to the LiDAR's; the offset between the two sensors is neglected.
 
     Raises:
         DamagedFileError: the file is missing or does not hold two rows of 12 finite numbers.
@@ -124,13 +124,13 @@ def read_poses(path: Path, camera: bool) -> Float[np.ndarray, "n 4 4"]:
         C = np.eye(4)
         C[:3, :3] = _R_LIDAR_CAMERA
         poses = C @ poses @ C.T
-    # Digits lost in the file: the nearest rotation.
+    # The nearest rotations, because the file holds only a few digits.
     poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()
     return poses
 
 
 def extended(path: Float[np.ndarray, "n d"], length: float) -> Float[np.ndarray, "m d"]:
-    """A path thinned to 1 m and lengthened straight ahead at both ends by `length` [m]."""
+    """A path resampled at 1 m and extended straight ahead by `length` [m] at either end."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     s = np.concatenate([[0], np.cumsum(steps)])
     grid = np.arange(0, max(s[-1], 1.0), 1.0)

@@ -1,4 +1,4 @@
-"""Scenery of a town and of a campus."""
+"""The scenery of a town and of a campus."""
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def _halls(site: Site, street: Street, side: int) -> None:
 
 
 def _parked_cars(site: Site, street: Street, side: int, share: float) -> None:
-    """Cars half on the pavement, as many as `share` of the places."""
+    """Park cars half on the pavement, in a share of the places."""
     rng = site.rng
     for spot in site.spots(street, side, 0.15, (6.0, 7.5)):
         if rng.random() < share:
@@ -113,7 +113,7 @@ def _along(
 
 
 def _meadow(site: Site, trees: list[Mesh], density: float) -> None:
-    """Trees and bushes scattered over the land that is left, so many to a square metre."""
+    """Scatter trees and bushes over the remaining land, about `density` trees per square metre."""
     count = int(density * np.prod(site.high - site.low) / len(trees))
     for mesh in trees:
         xy = site.rng.uniform(site.low, site.high, (count, 2))

@@ -1,4 +1,4 @@
-"""Worlds: what a preset's name stands for, and the static and moving things that are built for a drive."""
+"""Presets of simulated worlds, and the static and moving things that are built for a drive."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ class World:
     """Everything that rays can hit.
 
     Args:
-        static: what never moves, in the world frame.
-        movers: what moves.
+        static: everything that does not move, in the world frame.
+        movers: everything that moves.
     """
 
     static: Mesh
@@ -34,21 +34,21 @@ class World:
 
 @dataclass(frozen=True)
 class Preset:
-    """A kind of place and the way of moving through it.
+    """A kind of place and the way of moving through it. Pairs are the least and greatest of random values.
 
     Args:
-        driving: style of the drive; None for a Segway's run.
-        vehicle: that carries the sensor.
-        sensor: what it carries unless told otherwise.
-        slope_deg: of the terrain [deg].
-        half_width: of the road that is driven [m].
-        lane: distance of the driven path to the right of the road's centreline [m].
+        driving: style of the drive; None for the run of a Segway.
+        vehicle: the vehicle that carries the sensor.
+        sensor: makes the usual sensor.
+        slope_deg: slope of the terrain, see `Hills` [deg].
+        half_width: half the width of the road of the drive [m].
+        lane: distance of the drive to the right of the centreline of the road [m].
         profile: cross-section of the streets.
-        side_streets: distances between crossings (least, greatest) [m]; None for none.
+        side_streets: distance between crossings [m]; None for no crossings.
         furnish: builds the scenery.
-        oncoming: distance between cars that come the other way (least, greatest) [m].
-        traffic: speed of other cars (least, greatest) [m/s].
-        pedestrians: number of people walking about.
+        oncoming: distance between oncoming cars [m].
+        traffic: speed of other cars [m/s].
+        pedestrians: number of pedestrians.
     """
 
     driving: Driving | None
@@ -126,10 +126,10 @@ PRESETS = {
 
 
 def preset(name: str) -> Preset:
-    """The preset of that name.
+    """The preset of a name.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no such preset.
     """
     if name not in PRESETS:
         raise UserError(f"there is no simulated world {name!r}; choose one of {', '.join(PRESETS)}")
@@ -147,11 +147,11 @@ def build_world(
     """Build the world along a path.
 
     Args:
-        place: what kind of world.
-        rng: of all that is left to chance.
+        place: the kind of world.
+        rng: random generator of everything random.
         terrain: the ground.
-        track: the path that will be driven, and some way beyond both ends, about 1 m apart [m].
-        ego: times [s] and positions [m] of the drive itself, so that cars ahead keep their distance.
+        track: the path of the drive, extended beyond either end; points about 1 m apart [m].
+        ego: times [s] and positions [m] of the drive, so that cars ahead keep their distance.
         static: whether to leave out everything that moves.
     """
     main = Street(Street(track, place.half_width).offset(place.lane), place.half_width)
@@ -163,7 +163,7 @@ def build_world(
 
 
 def _side_streets(place: Preset, rng: np.random.Generator, main: Street) -> list[Street]:
-    """Streets that branch off: at every turn straight ahead, and at random intervals to one side."""
+    """Streets that branch off: straight ahead at every turn, and to one side at random intervals."""
     if place.side_streets is None:
         return []
     along, left = main.frames()
@@ -203,7 +203,7 @@ def _movers(
                 drift = np.clip(rng.normal(scale=0.02) * driven, -8, 8)
                 movers.append(Mover(_vehicle(rng), _raised(site, track), times, begin + driven + gap + drift))
     lanes = [(main.offset(place.lane)[::-1], place.oncoming)]
-    if main.half_width > 8:  # more lanes: others overtake, are overtaken, and come on two lanes
+    if main.half_width > 8:  # a wide road has a second lane in either direction
         lanes += [(main.offset(1.9)[::-1], place.oncoming), (main.offset(-1.9), place.oncoming)]
     for lane, spacing in lanes:
         line = _raised(site, lane)
@@ -225,5 +225,5 @@ def _vehicle(rng: np.random.Generator) -> Mesh:
 
 
 def _raised(site: Site, line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """A line on the ground."""
+    """The line, raised to the height of the ground."""
     return np.column_stack([line, site.ground(line)])
