@@ -1,4 +1,4 @@
-"""Pairs that might as well have been recorded: each change of the scans changes the label along."""
+"""Augmentation of training pairs: every change of the scans also changes the true relative pose."""
 
 import math
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from lidarlearn.geometry import se3
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What happens to training pairs by chance; nothing of it to validation.
+    """Random changes of training pairs; validation pairs stay as they are.
 
     Args:
-        mirror: half of the pairs are mirrored left to right: a left turn becomes a right one.
-        turn: the sensor is turned about its vertical axis by any angle: the columns of both images roll, and a car
+        mirror: mirror half of the pairs left to right: a left turn becomes a right turn.
+        turn: turn the sensor about its vertical axis by a random angle: the columns of both images roll, and a car
             that drives forward drives sideways. For platforms that move in any direction.
-        reverse: half of the pairs swap their scans: a car that drives forward drives backward.
-        max_skip: the second scan of a pair is up to so many scans after the first; 1 for neighbours alone. Steps of
-            two or three show a network trained in town the speeds of a motorway. See `ScanPairs`.
-        drop_out: up to this share of the pixels of each image is emptied.
+        reverse: swap the scans of half of the pairs: a car that drives forward drives backward.
+        max_skip: most scans from the first to the second scan of a pair; 1 for neighbours only. Steps of two or three
+            show a network trained in town the speeds of a motorway. See `ScanPairs`.
+        drop_out: largest share of the pixels of each image that are emptied.
     """
 
     mirror: bool = False
@@ -37,9 +37,9 @@ class Augmentation:
             raise ValueError(f"an augmentation needs max_skip >= 1 and 0 <= drop_out < 1, got {self}")
 
     def __call__(self, batch: Pair) -> Pair:
-        """The batch with each pair changed by a chance of its own, on whatever device it is.
+        """The batch with each pair changed independently, on the device where it is.
 
-        All chance comes out of the CPU's stream of random numbers, which a checkpoint keeps.
+        All randomness comes from the CPU's generator, whose state is kept in checkpoints.
         """
         (pairs, _, height, width), device = batch["reference"].shape, batch["reference"].device
         if self.mirror:
@@ -57,9 +57,9 @@ class Augmentation:
 
 
 def mirrored(pair: Pair) -> Pair:
-    """The pair as its mirror image at the plane y = 0, left and right exchanged.
+    """The pair mirrored at the plane y = 0: left and right are exchanged.
 
-    Azimuth a becomes -a, and with it column c becomes width - 1 - c.
+    Azimuth a becomes -a, so column c becomes width - 1 - c.
     """
     flip = torch.eye(4, dtype=torch.float64, device=pair["reference"].device)
     flip[1, 1] = -1
@@ -73,7 +73,7 @@ def mirrored(pair: Pair) -> Pair:
 
 
 def turned(pair: Pair, columns: Int[Tensor, "*batch"]) -> Pair:
-    """The pair as a sensor sees it that is turned, counter-clockwise, by the angle of so many columns."""
+    """The pair as seen by a sensor that is turned counter-clockwise by the angle of the given number of columns."""
     width = pair["reference"].shape[-1]
     angles = columns.double() * (-2 * math.pi / width)
     M = se3.from_euler(torch.nn.functional.pad(angles[..., None], (5, 0)))
@@ -87,7 +87,7 @@ def turned(pair: Pair, columns: Int[Tensor, "*batch"]) -> Pair:
 
 
 def reversed_in_time(pair: Pair) -> Pair:
-    """The later scan first; `index` stays that of the earlier one."""
+    """The pair with the later scan first; `index` remains that of the earlier one."""
     swapped = Pair(reference=pair["target"], target=pair["reference"], index=pair["index"])
     if "T_ref_new" in pair:
         swapped["T_ref_new"] = se3.inverse(pair["T_ref_new"])
@@ -95,7 +95,7 @@ def reversed_in_time(pair: Pair) -> Pair:
 
 
 def thinned(pair: Pair, keep_reference: Bool[Tensor, "*batch h w"], keep_target: Bool[Tensor, "*batch h w"]) -> Pair:
-    """The pair with all other pixels emptied."""
+    """The pair with all pixels emptied that are not to be kept."""
     reference, target = keep_reference.unsqueeze(-3), keep_target.unsqueeze(-3)
     return {**pair, "reference": pair["reference"] * reference, "target": pair["target"] * target}
 
@@ -106,7 +106,7 @@ def _seen_by(
     target: Float[Tensor, "*batch 3 h w"],
     M: Float[Tensor, "*#batch 4 4"],
 ) -> Pair:
-    """Other images of the pair's scans: points p have become M p, with an orthogonal M."""
+    """The pair with new vertex maps, in which each point p has become M p, with an orthogonal M."""
     image = Pair(reference=reference, target=target, index=pair["index"])
     if "T_ref_new" in pair:
         M = M.to(pair["T_ref_new"])
@@ -119,7 +119,7 @@ def _half_of(pairs: int, device: torch.device) -> Bool[Tensor, "batch"]:
 
 
 def _where(chosen: Bool[Tensor, "batch"], changed: Pair, batch: Pair) -> Pair:
-    """The chosen pairs as changed, the others as they are."""
+    """The chosen pairs from `changed`, the others from `batch`."""
 
     def choose(new: Tensor, old: Tensor) -> Tensor:
         return torch.where(chosen.reshape(-1, *[1] * (old.dim() - 1)), new, old)

@@ -1,4 +1,4 @@
-"""The known error of the HDL-64's factory calibration: all beams look a little too low."""
+"""Correction of the known error in the HDL-64's factory calibration: all beams point slightly too low."""
 
 import math
 
@@ -8,13 +8,13 @@ from torch import Tensor
 
 
 def raise_beams(points: Float[Tensor, "*batch n 3"], angle_deg: float) -> Float[Tensor, "*batch n 3"]:
-    """Points with every elevation raised by a constant angle, ranges and azimuths kept.
+    """Points with all elevations raised by a constant angle; ranges and azimuths stay the same.
 
-    Each point p turns by `angle_deg` about p x (0, 0, 1), that is towards +z. Points on the z axis have no such axis
-    and stay where they are.
+    Each point p is rotated by `angle_deg` about p x (0, 0, 1), towards +z. Points on the z axis have no such axis and
+    stay where they are.
 
     Args:
-        points: in the sensor frame.
+        points: in the sensor frame [m].
         angle_deg: 0.205 for KITTI; without it trajectories bend upwards and the translation error about doubles.
 
     Source: J.-E. Deschaud, IMLS-SLAM, ICRA 2018, who reports the wrong angles; the value as in CT-ICP (Dellenbach et

@@ -1,4 +1,4 @@
-"""Vertex maps on disk: each scan is read and projected once, then mapped into memory at every epoch."""
+"""Vertex maps on disk: each scan is read and projected once; every epoch reads the memory-mapped files."""
 
 import errno
 import hashlib
@@ -29,25 +29,25 @@ from lidarlearn.progress import tracked
 from lidarlearn.source_digest import source_digest
 
 QUANTUM_M = 0.004
-"""Coordinates are stored in multiples of this [m]: below a sensor's noise, and 16 bits reach 131 m."""
+"""Coordinates are stored as multiples of this [m]: less than the noise of sensors, and 16 bits reach 131 m."""
 
 _MAPS, _DONE = "vertex_maps.npy", "done.npy"
-_CHUNK = 32  # frames between two notes of what is done: at most so many are projected again after a kill
-_SPARE_BYTES = 50_000_000  # that are left to others
+_CHUNK = 32  # scans between two updates of `done.npy`: at most this many are projected again after a kill
+_SPARE_BYTES = 50_000_000  # to be left free on the disk
 _REMEDY = "datamodule.cache_root=/path/with/room, or the environment variable LIDARLEARN_CACHE"
 _MAKE_ROOM = f"\n  change: {_REMEDY}, or train on fewer scans (data.max_frames)"
 
 
 class VertexMaps:
-    """The vertex maps of sequences, one after another, mapped from files: no memory, and only paths travel to workers.
+    """The memory-mapped vertex maps of several sequences, one after another; pickled as the paths of their files.
 
     Args:
-        files: the .npy file of each sequence, of shape (n, 3, h, w), int16.
+        files: a .npy file for each sequence, of shape (n, 3, h, w), int16.
     """
 
     def __init__(self, *files: Path) -> None:
         self.files = files
-        # for reading alone: maps that might be written to count as memory, of which they may exceed what there is
+        # read-only: writable maps count as allocated memory, and they may exceed what there is
         self._maps = [np.load(file, mmap_mode="r") for file in files]
         self._ends = list(accumulate(map(len, self._maps)))
 
@@ -56,7 +56,7 @@ class VertexMaps:
 
     def __getitem__(self, rows: Int[Tensor, "*batch"] | int) -> Int16[Tensor, "*batch 3 h w"]:
         rows = torch.as_tensor(rows)
-        # torch's collation stacks them, in a worker directly in the memory that it shares: each map is copied once
+        # default_collate stacks directly into shared memory when in a worker: each map is copied once
         maps = default_collate([self._one(row) for row in rows.flatten().tolist()])
         return maps.reshape(*rows.shape, *maps.shape[1:])
 
@@ -65,11 +65,11 @@ class VertexMaps:
 
     @property
     def nbytes(self) -> int:
-        """Memory that all of them take."""
+        """Size of all vertex maps [B]."""
         return sum(maps.nbytes for maps in self._maps)
 
     def to(self, device: torch.device) -> Int16[Tensor, "n 3 h w"]:
-        """All of them, in the memory of a device."""
+        """All vertex maps, copied to the memory of a device."""
         resident = torch.empty(len(self), *self._maps[0].shape[1:], dtype=torch.int16, device=device)
         for row in tracked(range(len(self)), f"vertex maps to {device}", len(self)):
             resident[row] = self._one(row)
@@ -78,45 +78,45 @@ class VertexMaps:
     def _one(self, row: int) -> Int16[Tensor, "3 h w"]:
         sequence = bisect_right(self._ends, row)
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # and nobody writes to it
-            return torch.from_numpy(self._maps[sequence][row - self._ends[sequence]])  # counted from its end
+            warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # it is only read
+            return torch.from_numpy(self._maps[sequence][row - self._ends[sequence]])  # a negative index, from its end
 
 
 def encode(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Int16[Tensor, "*batch 3 h w"]:
-    """Metres to multiples of `QUANTUM_M`; points beyond the range of 16 bits become empty pixels."""
+    """Convert metres to multiples of `QUANTUM_M`; points beyond the range of 16 bits become empty pixels."""
     multiples = (vertex_map / QUANTUM_M).round()
     inside = (multiples.abs() <= torch.iinfo(torch.int16).max).all(dim=-3, keepdim=True)
     return torch.where(inside, multiples, 0).to(torch.int16)
 
 
 def decode(multiples: Int16[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
-    """Multiples of `QUANTUM_M` to metres, float32; empty pixels stay exact zeros."""
-    return multiples * QUANTUM_M  # of integers and a float torch makes float32, in one pass
+    """Convert multiples of `QUANTUM_M` to metres, float32; empty pixels stay exactly zero."""
+    return multiples * QUANTUM_M  # torch promotes integers times a float to float32 in one pass
 
 
 def cached_vertex_maps(
     sequence: Sequence, projection: SphericalProjection, cache_root: Path, num_workers: int = 0
 ) -> VertexMaps:
-    """The vertex maps of all scans of a sequence, projected now as far as they are not on disk yet.
+    """The vertex maps of all scans of a sequence; those that are not on disk yet are projected now.
 
-    The folder's name is a fingerprint of the scans, of the projection, and of the code that reads and projects: other
-    settings make another cache, and so does a changed reader. What earlier code made stays where it is, 280 kB a scan
-    in `cache_root`; `settings.json` in each folder says of which sequence, and any folder may be deleted at any time.
+    The name of the folder is a fingerprint of the scans, the projection, and the code that reads and projects: other
+    settings get another cache, and so does a changed reader. Caches of earlier code stay in `cache_root`, 280 kB a
+    scan; `settings.json` in each folder names its sequence, and any folder may be deleted at any time.
 
-    Any number of processes may ask at once: one projects, the others wait. A process killed half-way leaves what it
-    had finished to the next one.
+    Several processes may ask at the same time: one projects, the others wait. If it is killed, the next one continues
+    where it stopped.
 
     Args:
-        sequence: whose scans are projected.
+        sequence: provides the scans.
         projection: the image to project them into.
-        cache_root: folder of all caches; made where missing.
-        num_workers: processes that read and project; 0 does it in this one.
+        cache_root: folder of all caches; created if missing.
+        num_workers: processes that read and project; 0 does so in this one.
 
     Raises:
         DamagedFileError: a scan cannot be read.
-        UserError: the disk is too small, or cannot be written to.
+        UserError: the disk is too small or cannot be written to.
     """
-    folder, shape = _place(sequence, projection, cache_root)
+    folder, shape = _folder_and_shape(sequence, projection, cache_root)
     if not _complete(folder, shape):
         writable(folder, _REMEDY)
         with locked(folder / ".lock", f"sequence {sequence.name}: waiting for another process that projects it"):
@@ -126,26 +126,28 @@ def cached_vertex_maps(
 
 
 def require_room(sequences: Iterable[Sequence], projection: SphericalProjection, cache_root: Path) -> None:
-    """Raise UserError unless the disk has room for all vertex maps that the sequences still lack."""
-    lacking = sum(_lacking_bytes(*_place(sequence, projection, cache_root)) for sequence in sequences)
-    if not lacking:
+    """Raise a UserError unless the disk has room for all vertex maps that are still missing."""
+    missing = sum(_missing_bytes(*_folder_and_shape(sequence, projection, cache_root)) for sequence in sequences)
+    if not missing:
         return
     free = shutil.disk_usage(writable(cache_root, _REMEDY)).free
-    if free < lacking + _SPARE_BYTES:
+    if free < missing + _SPARE_BYTES:
         raise UserError(
             f"{cache_root.absolute()}: {free / 1e9:.2f} GB are free, and the vertex maps to be made take"
-            f" {lacking / 1e9:.2f} GB, beside {_SPARE_BYTES / 1e9:.2f} GB that are left to others.{_MAKE_ROOM}"
+            f" {missing / 1e9:.2f} GB, beside {_SPARE_BYTES / 1e9:.2f} GB that are left to others.{_MAKE_ROOM}"
         )
 
 
-def _place(sequence: Sequence, projection: SphericalProjection, cache_root: Path) -> tuple[Path, tuple[int, ...]]:
+def _folder_and_shape(
+    sequence: Sequence, projection: SphericalProjection, cache_root: Path
+) -> tuple[Path, tuple[int, ...]]:
     """Folder of a sequence's cache, and the shape of its vertex maps."""
     shape = (len(sequence), 3, projection.height, projection.width)
     return cache_root / _fingerprint(sequence, projection), shape
 
 
-def _lacking_bytes(folder: Path, shape: tuple[int, ...]) -> int:
-    """What a cache will take from the disk beyond what it has."""
+def _missing_bytes(folder: Path, shape: tuple[int, ...]) -> int:
+    """Disk space that a cache still needs, beyond what is reserved for it."""
     if _complete(folder, shape):
         return 0
     file = folder / _MAPS
@@ -159,7 +161,7 @@ def _fingerprint(sequence: Sequence, projection: SphericalProjection) -> str:
 
 
 def _code(sequence: Sequence) -> str:
-    """Digest of the sequence's reader and of this module, with all that they use."""
+    """Digest of the code of the sequence's reader and of this module, with all that they import."""
     return source_digest(type(sequence), Path(__file__))
 
 
@@ -171,17 +173,12 @@ def _complete(folder: Path, shape: tuple[int, ...]) -> bool:
 def _build(
     folder: Path, shape: tuple[int, ...], sequence: Sequence, projection: SphericalProjection, num_workers: int
 ) -> None:
-    """Project what is missing. Frames are flushed to disk before they are noted as done."""
+    """Project the missing scans. They are flushed to disk before they are marked as done."""
     require_room([sequence], projection, folder.parent)
-    maps = _opened(folder / _MAPS, shape, np.int16, "r+")
-    if maps is None:
-        (folder / _DONE).unlink(missing_ok=True)  # it was said of other maps
-        maps = np.lib.format.open_memmap(folder / _MAPS, mode="w+", dtype=np.int16, shape=shape)
-    _reserve(folder / _MAPS)
-    done = _opened(folder / _DONE, shape[:1], np.bool_, "r+")
-    if done is None:
-        done = np.lib.format.open_memmap(folder / _DONE, mode="w+", dtype=np.bool_, shape=shape[:1])
-    _reserve(folder / _DONE)
+    if _opened(folder / _MAPS, shape, np.int16) is None:
+        (folder / _DONE).unlink(missing_ok=True)  # it belonged to other maps
+    maps = _opened_or_made(folder / _MAPS, shape, np.int16)
+    done = _opened_or_made(folder / _DONE, shape[:1], np.bool_)
     (folder / "settings.json").write_text(
         json.dumps(
             {"sequence": sequence.name, "fingerprint": sequence.fingerprint, "code": _code(sequence)}
@@ -195,7 +192,7 @@ def _build(
         _ProjectedScans(sequence, projection, missing),
         batch_size=None,
         num_workers=min(num_workers, len(missing)),
-        generator=torch.Generator(),  # leaves the global one alone: a training is the same with or without a cache
+        generator=torch.Generator(),  # not the global one: a training is the same with or without a cache
     )
     finished: list[int] = []
     for index, vertex_map in tracked(scans, f"projecting sequence {sequence.name}", len(missing)):
@@ -210,9 +207,9 @@ def _build(
 
 
 def _opened(file: Path, shape: tuple[int, ...], dtype: type, mode: Literal["r", "r+"] = "r") -> np.memmap | None:
-    """A .npy file mapped into memory; None where it is absent, truncated or holds something else."""
+    """A memory-mapped .npy file; None if it is missing, truncated or holds something else."""
     try:
-        array = np.lib.format.open_memmap(file, mode="r")  # mapped for writing, a short file would be filled with zeros
+        array = np.lib.format.open_memmap(file, mode="r")  # "r+" would fill up a truncated file with zeros
         if array.shape != shape or array.dtype != dtype:
             return None
         return array if mode == "r" else np.lib.format.open_memmap(file, mode=mode)
@@ -220,13 +217,22 @@ def _opened(file: Path, shape: tuple[int, ...], dtype: type, mode: Literal["r", 
         return None
 
 
-def _reserve(file: Path) -> None:
-    """Take from the disk what a file needs that is mapped for writing, in which new ones have nothing but holes.
+def _opened_or_made(file: Path, shape: tuple[int, ...], dtype: type) -> np.memmap:
+    """A .npy file mapped for writing, with all of its disk space allocated."""
+    array = _opened(file, shape, dtype, "r+")
+    if array is None:
+        array = np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=shape)
+    _reserve(file)
+    return array
 
-    A disk that fills up under a mapped file kills the process without a word, and other runs fill it at the same time.
+
+def _reserve(file: Path) -> None:
+    """Allocate the disk space of a file that will be mapped for writing: a new one is sparse.
+
+    If the disk filled up, for example by other runs, writing to the map would kill the process without a message.
 
     Raises:
-        UserError: there is not so much; the file is deleted.
+        UserError: there is not enough space; the file is deleted.
     """
     if not hasattr(os, "posix_fallocate"):  # macOS
         return
@@ -234,7 +240,7 @@ def _reserve(file: Path) -> None:
         with file.open("ab") as opened:
             os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
     except OSError as error:
-        if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # of a file system that cannot
+        if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # the file system cannot reserve space
             return
         size = file.stat().st_size
         file.unlink()
@@ -244,9 +250,9 @@ def _reserve(file: Path) -> None:
 
 
 class _ProjectedScans(Dataset[tuple[int, Tensor | UserError]]):
-    """Encoded vertex maps of chosen scans. What the user can mend is handed over as a value.
+    """Encoded vertex maps of selected scans, with their indices; a `UserError` is returned in place of a map.
 
-    Raised in a worker it would come out as another type, with the worker's stack trace for its message.
+    If a worker raised it, it would arrive with the worker's stack trace as its message.
     """
 
     def __init__(self, sequence: Sequence, projection: SphericalProjection, indices: list[int]) -> None:

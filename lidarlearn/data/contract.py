@@ -1,4 +1,4 @@
-"""What a reader has to give, whoever wrote it: errors that say what it gave instead, before work on it begins."""
+"""Checks of what a reader returns, before any work on it begins: not every reader is part of this package."""
 
 from collections.abc import Iterable
 
@@ -9,7 +9,7 @@ from lidarlearn.errors import UserError
 
 
 def require_poses(name: str, T_world_lidar: object, count: int) -> None:
-    """Raise a UserError unless a sequence has a finite pose for each of its scans, in float64, or none at all."""
+    """Raise a UserError unless a sequence has a finite float64 pose for each of its scans, or none at all."""
     if T_world_lidar is None:
         return
     what, meaning = f"{name}: T_world_lidar is", "one pose a scan, or None without ground truth"
@@ -25,7 +25,7 @@ def require_timestamps(name: str, timestamps: object, count: int) -> None:
 
 
 def require_points(name: str, points: object, times: object) -> None:
-    """Raise a UserError unless the first scan's points are x y z in float32, with a time for each of them or none."""
+    """Raise a UserError unless the points of the first scan are float32 x y z, with a time for each of them or none."""
     what = f"{name}: in its first scan,"
     cloud = _require(f"{what} points is", points, (None, 3), torch.float32, "x y z [m] of each point, nothing else")
     if times is not None:
@@ -35,7 +35,7 @@ def require_points(name: str, points: object, times: object) -> None:
 def _require(
     what: str, value: object, shape: tuple[int | None, ...], dtype: torch.dtype | None, meaning: str
 ) -> Tensor:
-    """The value, which has to be a tensor of that shape and type; None stands for any number, or any type."""
+    """The value, which must be a tensor of that shape and type; None stands for any length or type."""
     if isinstance(value, Tensor) and dtype in (None, value.dtype) and value.dim() == len(shape):
         if all(wanted in (None, there) for wanted, there in zip(shape, value.shape, strict=True)):
             return value
@@ -44,7 +44,7 @@ def _require(
 
 
 def _require_finite(what: str, values: Tensor, kind: str) -> None:
-    """Of each scan's values, whose first axis it is."""
+    """Check values whose first axis is that of the scans."""
     wrong = ~values.isfinite().flatten(1).all(dim=1)
     if bool(wrong.any()):
         raise UserError(

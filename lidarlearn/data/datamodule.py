@@ -1,4 +1,4 @@
-"""The pairs of a data set's sequences as Lightning wants them."""
+"""The Lightning datamodule: pairs of scans from the sequences of a data set."""
 
 import math
 import os
@@ -21,26 +21,26 @@ from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 
-_RESIDENT_SHARE = 0.5  # of the free memory: the rest is the network's and its batches'
+_RESIDENT_SHARE = 0.5  # of the free memory: the network and its batches need the rest
 
 
 class OdometryDataModule(LightningDataModule):
     """Training pairs shuffled over all training sequences; each validation sequence on its own, in order.
 
-    Batches reach the device as 16-bit integers, or as row numbers of the vertex maps that are there for good; they are
-    decoded there, and changed by chance.
+    Batches reach the device as 16-bit integers, or as row numbers of vertex maps that are kept there. They are decoded
+    and augmented on the device.
 
     Args:
         data: the data set.
-        batch_size: pairs of a batch.
+        batch_size: pairs per batch.
         num_workers: processes that load batches; 0 loads them in the training process.
-        cache_root: folder of the vertex maps' caches.
-        height: rows of the network's image [px]; None takes the data set's.
-        width: its columns [px]; None takes the data set's.
-        resident: whether all vertex maps, 6 bytes a pixel, are kept in the memory of the device; "auto" does so on a
-            GPU where they take less than half of what is free.
-        augmentation: what is done to training pairs by chance; None for nothing.
-        preparation_workers: processes that project scans into the cache; None takes one per core.
+        cache_root: folder of the cached vertex maps.
+        height: rows of the network's image [px]; None takes those of the data set.
+        width: columns of the network's image [px]; None takes those of the data set.
+        resident: whether to keep all vertex maps, 6 bytes a pixel, in the memory of the device; "auto" does so on a GPU
+            if they take less than half of its free memory.
+        augmentation: random changes of training pairs; None for none.
+        preparation_workers: processes that project scans into the cache; None for one per core.
     """
 
     def __init__(
@@ -72,15 +72,15 @@ class OdometryDataModule(LightningDataModule):
         self._resident_maps: Int16[Tensor, "n 3 h w"] | None = None
 
     def prepare_data(self) -> None:
-        """Make the data, where it is made on the spot, and the caches; Lightning calls it in one process only.
+        """Simulate scans if the data set is a simulated one, and fill the caches; Lightning calls it in one process.
 
         Raises:
-            DataSetNotFoundError: something that is needed is missing.
-            DamagedFileError: a scan, or poses, cannot be read.
-            UserError: a sequence lacks the ground truth that the module `needs_ground_truth` for, or the disk room.
+            DataSetNotFoundError: a sequence is missing.
+            DamagedFileError: a scan or poses cannot be read.
+            UserError: a sequence has no ground truth but the module `needs_ground_truth`, or the disk is too small.
         """
         self.data.prepare()
-        # All are opened first: what is missing or unlabelled is told before minutes of projecting.
+        # All are opened first: errors show before minutes of projecting.
         sequences = self.data.sequences(dict.fromkeys([*self.data.train_sequences, *self.data.val_sequences]))
         if self.trainer is not None and getattr(self.trainer.lightning_module, "needs_ground_truth", False):
             _require_ground_truth(sequences)
@@ -89,7 +89,7 @@ class OdometryDataModule(LightningDataModule):
             self._vertex_maps(sequence)
 
     def setup(self, stage: str | None = None) -> None:
-        """Open sequences and caches; called in every process."""
+        """Open the sequences and their caches; called in every process."""
         names = dict.fromkeys([*self.data.train_sequences, *self.data.val_sequences])
         sequences = {name: self.data.sequence(name) for name in names}
         self._maps = cache.VertexMaps(*(file for s in sequences.values() for file in self._vertex_maps(s).files))
@@ -98,7 +98,7 @@ class OdometryDataModule(LightningDataModule):
 
         def pairs(names: Collection[str], max_skip: int = 1) -> ScanPairs:
             poses = [T for name in names if (T := sequences[name].T_world_lidar) is not None]
-            # One sequence without ground truth and the batches of all go without: a batch holds the same for each pair.
+            # One sequence without ground truth, and none is used: all pairs of a batch need the same entries.
             return ScanPairs([rows[name] for name in names], poses if len(poses) == len(names) else None, max_skip)
 
         self._train_pairs = pairs(self.data.train_sequences, self.augmentation.max_skip if self.augmentation else 1)
@@ -113,10 +113,10 @@ class OdometryDataModule(LightningDataModule):
             self.keep_maps_on(self.trainer.strategy.root_device)
 
     def keep_maps_on(self, device: torch.device) -> None:
-        """Copy all vertex maps to the device that trains, if `resident` says so; `setup` does it for its trainer.
+        """Copy all vertex maps to the training device if `resident` says so; `setup` calls it with the trainer's.
 
         Raises:
-            UserError: its memory is too small.
+            UserError: the memory of the device is too small.
         """
         self._resident_maps, needed = None, self._maps.nbytes
         if self.resident is False or (self.resident == "auto" and needed > _RESIDENT_SHARE * _free_memory(device)):
@@ -130,13 +130,13 @@ class OdometryDataModule(LightningDataModule):
             ) from error
 
     def teardown(self, stage: str | None = None) -> None:
-        """Give the device's memory back: another training of the same process may follow."""
+        """Release the memory of the device: another training may follow in the same process."""
         self._resident_maps = None
 
     def train_dataloader(self) -> DataLoader[Pair]:
-        """Shuffled pairs of all training sequences; a last, smaller batch is left out."""
+        """Shuffled pairs of all training sequences; an incomplete last batch is dropped unless it is the only one."""
         processes = 1 if self.trainer is None else self.trainer.world_size
-        pairs_each = math.ceil(len(self._train_pairs) / processes)  # the sampler fills up
+        pairs_each = math.ceil(len(self._train_pairs) / processes)  # the sampler repeats pairs to fill up
         return self._loader(self._train_pairs, shuffle=True, drop_last=pairs_each > self.batch_size)
 
     def val_dataloader(self) -> list[DataLoader[Pair]]:
@@ -144,15 +144,15 @@ class OdometryDataModule(LightningDataModule):
         return [self._loader(pairs) for pairs in self._val_pairs]
 
     def on_after_batch_transfer(self, batch: Pair, dataloader_idx: int) -> Pair:
-        """Complete a batch, see `completed`."""
+        """Complete a batch on the device, see `completed`."""
         return self.completed(batch, augmented=self.trainer is not None and bool(self.trainer.training))
 
     def completed(self, batch: Pair, augmented: bool) -> Pair:
-        """A batch of a loader, moved to the device, as the network gets it: vertex maps in metres.
+        """A batch from a loader, already on the device, with the vertex maps in metres that the network takes.
 
         Args:
-            batch: holds encoded maps, or the rows of resident ones.
-            augmented: whether it is changed by chance, as those of training are.
+            batch: holds encoded maps, or rows of the resident ones.
+            augmented: whether to augment it, as in training.
         """
         if self._resident_maps is not None:
             batch = with_maps(batch, self._resident_maps)
@@ -164,8 +164,7 @@ class OdometryDataModule(LightningDataModule):
 
     def _loader(self, pairs: ScanPairs, shuffle: bool = False, drop_last: bool = False) -> DataLoader[Pair]:
         is_resident = self._resident_maps is not None
-        # a few numbers are sooner looked up than handed over by another process
-        num_workers = 0 if is_resident else self.num_workers
+        num_workers = 0 if is_resident else self.num_workers  # row numbers do not pay for another process
         return DataLoader(
             pairs,
             batch_size=self.batch_size,
@@ -173,17 +172,17 @@ class OdometryDataModule(LightningDataModule):
             drop_last=drop_last,
             collate_fn=default_convert if is_resident else partial(with_maps, maps=self._maps),
             num_workers=num_workers,
-            # of training only until the epoch ends: new ones begin with the main process' random numbers, which a
-            # resumed training takes up
+            # Training starts new workers every epoch: their seeds come from the global random state, which a
+            # checkpoint restores.
             persistent_workers=num_workers > 0 and not shuffle,
-            # validation starts its workers once a run, however often that was resumed: not with numbers of that stream
+            # Validation starts its workers once per run, whether resumed or not: that must not use the global state.
             generator=None if shuffle else torch.Generator(),
             pin_memory=torch.cuda.is_available() and not is_resident,
         )
 
 
 def _free_memory(device: torch.device) -> int:
-    """What a GPU has to share [B]; a CPU nothing: it reads the files from its own memory as it is."""
+    """Memory of a GPU that is not in use [B]; 0 for a CPU, where copies of the mapped files gain nothing."""
     if device.type != "cuda":
         return 0
     return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
@@ -194,7 +193,7 @@ def _require_ground_truth(sequences: Mapping[str, Sequence]) -> None:
     if without:
         raise UserError(
             f"loss=supervised needs ground truth, and there is none of {', '.join(without)}.\n"
-            "  change: data.train_sequences and data.val_sequences to those that have it, or loss=weighted_icp"
+            "  change: data.train_sequences and data.val_sequences to sequences that have it, or loss=weighted_icp"
         )
 
 

@@ -1,4 +1,4 @@
-"""What can be wrong with a copy of a data set."""
+"""Errors about the copy of a data set."""
 
 from pathlib import Path
 
@@ -11,13 +11,13 @@ ROOT_REMEDY = (
 
 
 class DataSetNotFoundError(UserError):
-    """A data set, or a part of it that is needed, is not where it was looked for.
+    """A data set, or a required part of it, was not found.
 
     Args:
-        name: the data set, as its authors call it.
+        name: of the data set, as its authors call it.
         missing: what was not found.
-        looked_in: the path where it was looked for.
-        source: where the data comes from.
+        looked_in: path at which it was expected.
+        source: where to get the data.
         remedy: which setting to change.
     """
 
@@ -31,11 +31,11 @@ class DataSetNotFoundError(UserError):
 
 
 class DamagedFileError(UserError):
-    """A file is there but cannot be what it should be.
+    """A file exists but its content is not what it should be.
 
     Args:
         path: the file.
-        problem: what was seen and what was expected.
+        problem: what was found and what was expected.
         remedy: what to do about it.
     """
 
@@ -44,13 +44,13 @@ class DamagedFileError(UserError):
 
 
 def one_line(message: object) -> str:
-    """An error's message for a table or a list."""
+    """The message of an error on one line, for a table or a list."""
     return " ".join(line.strip() for line in str(message).splitlines())
 
 
 def require_count(setting: str, value: int | None, optional: bool = False) -> None:
-    """Raise UserError unless a setting is an integer of at least 1, or None where that is allowed."""
+    """Raise a UserError unless a setting is an integer of at least 1, or None if that is allowed."""
     if (value is None and optional) or (isinstance(value, int) and value >= 1):
         return
     seen = "null" if value is None else value
-    raise UserError(f"{setting}={seen}: no number of scans.\n  change: {setting} to an integer of at least 1")
+    raise UserError(f"{setting}={seen}: not a number of scans.\n  change: {setting} to an integer of at least 1")

@@ -1,4 +1,4 @@
-"""Whether the scans of a data set fit the image that is configured for its sensor."""
+"""Whether the scans of a data set fit into the image configured for its sensor."""
 
 import torch
 from jaxtyping import Float
@@ -6,16 +6,16 @@ from torch import Tensor
 
 from lidarlearn.geometry.projection import SphericalProjection
 
-_TOLERATED_SHARE = 0.1  # a wrong sensor's image loses a third; the right one a few returns of its outermost beams
+_TOLERATED_SHARE = 0.1  # the image of a wrong sensor loses a third; the right one a few returns of the outermost beams
 
 
 def view_remark(name: str, points: Float[Tensor, "n 3"], projection: SphericalProjection) -> str | None:
-    """What to say where many of a scan's points lie above or below the image; None where it fits.
+    """A warning if many points of a scan lie above or below the image; None if they fit.
 
     Args:
         name: of the sequence.
-        points: of its first scan.
-        projection: the image as configured.
+        points: of its first scan [m].
+        projection: the configured image.
     """
     points = points[(points != 0).any(dim=1)]
     if not len(points):

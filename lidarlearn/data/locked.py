@@ -1,4 +1,4 @@
-"""What one process makes while others wait for it."""
+"""A file lock between processes."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,11 +9,11 @@ from filelock import FileLock, Timeout
 
 @contextmanager
 def locked(file: Path, waiting: str) -> Iterator[None]:
-    """Hold a lock; say so when another process makes this one wait.
+    """Hold a lock; print a message if another process holds it.
 
     Args:
-        file: of the lock; made where missing.
-        waiting: what is said then.
+        file: of the lock; created if missing.
+        waiting: the message.
     """
     lock = FileLock(file)
     try:

@@ -1,4 +1,4 @@
-"""Pairs of neighbouring scans, what a network that regresses relative poses trains on."""
+"""Pairs of consecutive scans, on which a network that regresses relative poses is trained."""
 
 from collections.abc import Sequence
 from typing import TypedDict
@@ -14,13 +14,13 @@ from lidarlearn.geometry import se3
 
 
 class Pair(TypedDict):
-    """Two neighbouring scans, or a batch of such.
+    """Two consecutive scans, or a batch of such pairs.
 
     Keys:
-        reference: vertex map of the earlier scan [m], zeros where no point fell. Of what `ScanPairs` gives, its row
+        reference: vertex map of the earlier scan [m], zeros where no point fell; in the pairs of `ScanPairs`, its row
             among all vertex maps, see `with_maps`.
         target: vertex map of the new scan, likewise.
-        index: the reference's place in its sequence.
+        index: of the reference in its sequence.
         T_ref_new: true relative pose, float64; only with ground truth.
     """
 
@@ -31,13 +31,13 @@ class Pair(TypedDict):
 
 
 class ScanPairs(Dataset[Pair]):
-    """The pairs (i, i + 1) of sequences, in order, a batch of them at once and in numbers only.
+    """The pairs (i, i + 1) of sequences, in order; yields whole batches, with row numbers in place of vertex maps.
 
     Args:
-        rows: of each sequence's scans among all vertex maps.
-        T_world_lidar: ground-truth poses of each sequence's scans; None to go without.
-        max_skip: the second scan of a pair is by chance up to so many after the first; near the end of a sequence as
-            many as there are.
+        rows: rows of each sequence among all vertex maps.
+        T_world_lidar: ground-truth poses of each sequence; None for none.
+        max_skip: the second scan of a pair is a random number of scans, up to this one, after the first, but never
+            beyond the end of the sequence.
 
     Raises:
         ValueError: the numbers of scans and poses differ, or a pose is not finite.
@@ -60,7 +60,7 @@ class ScanPairs(Dataset[Pair]):
         return len(self._references)
 
     def __getitems__(self, indices: list[int]) -> Pair:
-        """A batch of pairs, as torch's loaders ask for it."""
+        """A batch of pairs; called by torch's loaders."""
         chosen = torch.tensor(indices)
         reference = self._references[chosen]
         step = 1 if self.max_skip == 1 else torch.randint(1, self.max_skip + 1, reference.shape)
@@ -72,12 +72,12 @@ class ScanPairs(Dataset[Pair]):
 
 
 def with_maps(batch: Pair, maps: VertexMaps | Shaped[Tensor, "n 3 h w"]) -> Pair:
-    """The batch with vertex maps in place of their rows, as encoded, from files or from the memory of its device."""
+    """The batch with encoded vertex maps in place of their rows, from files or from the memory of its device."""
     return {**batch, "reference": maps[batch["reference"]], "target": maps[batch["target"]]}
 
 
 def _by_row(rows: Sequence[range], T_world_lidar: Sequence[Float[Tensor, "_ 4 4"]]) -> Float[Tensor, "m 4 4"]:
-    """The pose of each row; not a number for those of other sequences."""
+    """The pose of each row; NaN for rows of other sequences."""
     by_row = torch.full((max((r.stop for r in rows), default=0), 4, 4), torch.nan, dtype=torch.float64)
     for scans, poses in zip(rows, T_world_lidar, strict=True):
         finite = int(poses.isfinite().all(-1).all(-1).sum())

@@ -1,6 +1,6 @@
 """PCL's clouds (.pcd): text, binary and compressed, read with the library `pypcd4`.
 
-It takes one spelling of what the format leaves open: a COUNT, single blanks between numbers, comments in UTF-8.
+The library is stricter than the format: it requires a COUNT, single blanks between numbers, and comments in UTF-8.
 """
 
 import io
@@ -19,10 +19,10 @@ _HEADER = re.compile(rb"(.*?^DATA[^\S\n]+\w+)\s*?\n", re.DOTALL | re.MULTILINE)
 
 
 def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
-    """The fields by name in lower case.
+    """The fields by lower-case name.
 
     Raises:
-        DamagedFileError: not such a file, or a truncated one.
+        DamagedFileError: the file is not a .pcd file, or is truncated.
     """
     content = bytes(read_bytes(path))
     header = _HEADER.match(content)
@@ -31,13 +31,13 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
     body = content[header.end() :]
     try:
         entries = _entries(header[1].decode("latin-1"))
-        needed, there = _needed_bytes(entries, body), len(body)
-        cloud = PointCloud.from_fileobj(_spelt_for_pypcd4(entries, body)) if there >= needed else None
-    except Exception as error:  # the library's are of many kinds, none of them its own
+        needed = _needed_bytes(entries, body)
+        cloud = PointCloud.from_fileobj(_normalized(entries, body)) if len(body) >= needed else None
+    except Exception as error:  # the library raises many types, none of its own
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise DamagedFileError(path, f"no .pcd file that can be read ({reason})") from error
     if cloud is None:
-        raise DamagedFileError(path, f"truncated: {there} bytes of points where its header says {needed}")
+        raise DamagedFileError(path, f"truncated: {len(body)} bytes of points where its header says {needed}")
     rows = np.atleast_1d(cloud.pc_data)
     if len(rows) != cloud.metadata.points:
         raise DamagedFileError(path, f"truncated: {len(rows)} points where its header says {cloud.metadata.points}")
@@ -45,27 +45,28 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _entries(header: str) -> dict[str, list[str]]:
-    """The words of each line behind its first one; with the COUNT that the format leaves optional."""
+    """The words of each line by its first word; with the COUNT that is optional in the format."""
     lines = (line.split() for line in header.splitlines() if not line.startswith("#"))
     entries = {words[0].upper(): words[1:] for words in lines if words}
     return {"COUNT": ["1"] * len(entries["FIELDS"])} | entries
 
 
 def _needed_bytes(entries: dict[str, list[str]], body: bytes) -> int:
-    """Bytes that the points take; 0 for text, where nobody can tell."""
+    """Size of the points [B]; 0 for text, where it is unknown."""
     match entries["DATA"][0]:
         case "binary":
-            of_a_point = (int(size) * int(count) for size, count in zip(entries["SIZE"], entries["COUNT"], strict=True))
-            return int(entries["POINTS"][0]) * sum(of_a_point)
+            fields = (int(size) * int(count) for size, count in zip(entries["SIZE"], entries["COUNT"], strict=True))
+            return int(entries["POINTS"][0]) * sum(fields)
         case "binary_compressed":
             return 8 + int.from_bytes(body[:4], "little")
         case _:
             return 0
 
 
-def _spelt_for_pypcd4(entries: dict[str, list[str]], body: bytes) -> io.BufferedReader:
-    entries = entries | {"VERSION": ["0.7"]}  # of older ones, which it refuses, the lines say the same
-    order = sorted(entries, key=lambda entry: entry == "DATA")  # the header ends there
+def _normalized(entries: dict[str, list[str]], body: bytes) -> io.BufferedReader:
+    """The file in the spelling that the library accepts."""
+    entries = entries | {"VERSION": ["0.7"]}  # it rejects older versions, whose lines mean the same
+    order = sorted(entries, key=lambda entry: entry == "DATA")  # the header ends with this line
     header = "".join(f"{entry} {' '.join(entries[entry])}\n" for entry in order)
     if entries["DATA"] == ["ascii"]:
         body = b"\n".join(b" ".join(line.split()) for line in body.split(b"\n"))

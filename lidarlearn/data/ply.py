@@ -1,8 +1,8 @@
 """Polygon files (.ply): the properties of their vertices.
 
-On disk: lines of a header that say, element after element, of what type each property is, then the elements' values,
-in text or binary. Types have two sets of names, and cloud programs use both: Open3D writes `uchar` beside `uint16`.
-What follows the vertices (PCL's camera, faces) is not looked at.
+On disk: a text header lists the elements and the type of each of their properties; the values follow in the same
+order, as text or binary. Types have two sets of names, and programs mix them: Open3D writes `uchar` beside `uint16`.
+Elements after the vertices (PCL's camera, faces) are ignored.
 """
 
 import io
@@ -29,12 +29,12 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class _Element:
-    """A kind of thing that a file holds.
+    """An element of the header.
 
     Args:
         name: "vertex", "face", ...
-        count: how many there are.
-        properties: name and type of each; of a list the type is no single one.
+        count: number of records.
+        properties: name and type of each; the type of a list is several words.
     """
 
     name: str
@@ -42,10 +42,10 @@ class _Element:
     properties: list[tuple[str, str]] = field(default_factory=list)
 
     def dtype(self, order: str) -> np.dtype[Any]:
-        """Of a binary record, its fields numbered: names may be the same twice.
+        """Type of a binary record, whose fields are numbered: names may occur twice.
 
         Raises:
-            ValueError: a property has no such type as PLY has, or is a list, whose records differ in length.
+            ValueError: a property has an unknown type, or is a list, whose records differ in length.
         """
         if unknown := [f"{kind} {name}" for name, kind in self.properties if kind not in _TYPES]:
             raise ValueError(f"properties of element {self.name} that cannot be read: {', '.join(unknown)}")
@@ -53,10 +53,10 @@ class _Element:
 
 
 def read_ply(path: Path) -> dict[str, NDArray[Any]]:
-    """The vertices' properties by name in lower case.
+    """The properties of the vertices by lower-case name.
 
     Raises:
-        DamagedFileError: not such a file, or a truncated one.
+        DamagedFileError: the file is not a .ply file, or is truncated.
     """
     content = read_bytes(path)
     header = _HEADER.match(content)
@@ -78,11 +78,11 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def write_ply(path: Path, fields: Mapping[str, NDArray[np.float32]]) -> None:
-    """Write a cloud as .ply, binary.
+    """Write a cloud as a binary .ply file.
 
     Args:
         path: the file.
-        fields: x, y, z and any more, a value for each point.
+        fields: x, y, z and any others, one value per point.
     """
     rows = np.stack(list(fields.values()), axis=1).astype("<f4")
     properties = "".join(f"property float {name}\n" for name in fields)
@@ -107,16 +107,16 @@ def _parsed(header: str) -> tuple[str, list[_Element]]:
 def _binary_rows(
     content: bytearray, start: int, before: list[_Element], vertices: _Element, order: str
 ) -> NDArray[Any]:
-    """As many of the vertices as are there."""
+    """The vertices; fewer than the header says if the file is truncated."""
     start += sum(element.count * element.dtype(order).itemsize for element in before)
     dtype = vertices.dtype(order)
-    there = max(len(content) - start, 0) // max(dtype.itemsize, 1)
-    return np.frombuffer(content, dtype, min(there, vertices.count), min(start, len(content)))
+    available = max(len(content) - start, 0) // max(dtype.itemsize, 1)
+    return np.frombuffer(content, dtype, min(available, vertices.count), min(start, len(content)))
 
 
 def _text_rows(text: bytearray, before: int, vertices: _Element) -> NDArray[Any]:
-    """As many of the vertices as are there, after `before` lines of other elements."""
+    """The vertices after `before` lines of other elements; fewer than the header says if the file is truncated."""
     lines = text.split(b"\n")[before:][: vertices.count]
     dtype = np.dtype([(name, "f8") for name in vertices.dtype("=").names or ()])
-    there = [line for line in lines if line.strip()]
-    return np.loadtxt(io.BytesIO(b"\n".join(there)), dtype, comments=None, ndmin=1) if there else np.zeros(0, dtype)
+    filled = [line for line in lines if line.strip()]
+    return np.loadtxt(io.BytesIO(b"\n".join(filled)), dtype, comments=None, ndmin=1) if filled else np.zeros(0, dtype)

@@ -1,4 +1,4 @@
-"""Range images of simulated drives: where they lie, and how several threads make them."""
+"""Range images of simulated drives: their files, and making them in several threads."""
 
 import copy
 import os
@@ -16,29 +16,29 @@ from lidarlearn.simulation.drive import Drive
 
 
 def image_path(folder: Path, index: int) -> Path:
-    """File of one range image."""
+    """The file of one range image."""
     return folder / f"{index:06d}.npy"
 
 
 def missing_images(folder: Path, indices: Iterable[int]) -> list[int]:
-    """Those of the scans that have no file yet."""
-    there = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
-    return [i for i in indices if image_path(folder, i).name not in there]
+    """The indices of scans that have no file yet."""
+    existing = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
+    return [i for i in indices if image_path(folder, i).name not in existing]
 
 
 def make_images(jobs: list[tuple[Drive, Path, list[int]]], workers: int) -> None:
-    """Simulate and write scans, with their progress shown; drives are shared out where workers would be idle.
+    """Simulate and write scans, showing progress; several workers share a drive if there are fewer drives than workers.
 
     Args:
-        jobs: drives, the folder of each one's images, and which are to be made.
-        workers: threads that make them.
+        jobs: for each drive its settings, the folder of its images, and the indices to make.
+        workers: number of threads.
     """
     parts = max(1, workers // len(jobs))
     shared = [(_SharedDrive(drive, parts), folder, indices) for drive, folder, indices in jobs]
     portions = [(drive, folder, indices[k::parts]) for drive, folder, indices in shared for k in range(parts)]
     total = sum(len(indices) for _, _, indices in jobs)
     stop = threading.Event()
-    # Threads do, and need no importable main module: ray casting and numpy's loops run without the interpreter's lock.
+    # Threads are enough, and need no importable main module: ray casting and numpy's loops release the GIL.
     what = f"simulating {len(jobs)} drive{'s' if len(jobs) > 1 else ''}"
     with progress(what, total) as advance, ThreadPoolExecutor(max(1, workers)) as pool:
         running = {pool.submit(_work, *portion, stop, advance) for portion in portions}
@@ -51,11 +51,11 @@ def make_images(jobs: list[tuple[Drive, Path, list[int]]], workers: int) -> None
 
 
 class _SharedDrive:
-    """A drive whose world, which may take gigabytes, is built once for all who make its scans, and then let go.
+    """A drive whose world, which may take gigabytes, is built once for all its users and freed after the last one.
 
     Args:
         drive: the settings.
-        users: how many there will be.
+        users: how many times `built` will be entered.
     """
 
     def __init__(self, drive: Drive, users: int) -> None:
@@ -72,7 +72,7 @@ class _SharedDrive:
             with self._lock:
                 self._left -= 1
                 if not self._left:
-                    self._drive = copy.copy(self._drive)  # a copy is without the world
+                    self._drive = copy.copy(self._drive)  # without the world, which is not copied
 
 
 def _work(

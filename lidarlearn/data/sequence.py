@@ -1,4 +1,4 @@
-"""The two interfaces behind which every data set stands: a `Sequence` of scans and the `DataSet` it belongs to."""
+"""The two interfaces of every data set: a `Sequence` of scans, and the `DataSet` it belongs to."""
 
 import logging
 import os
@@ -31,10 +31,10 @@ class Scan:
 
     Args:
         points: float32 [m] in the sensor frame: x forward, y left, z up; finite.
-        times: when each point was measured, as a share of the scan period relative to the instant the scan's pose
-            refers to, e.g. in [-0.5, 0.5) where that is the middle of the sweep; None where scans are already
-            motion compensated or carry no times.
-        intensities: reflectance as the sensor gives it, in [0, 1]; None where there is none.
+        times: when each point was measured, as a share of the scan period relative to the instant of the scan's pose,
+            e.g. in [-0.5, 0.5) if that is the middle of the sweep; None if scans are already motion compensated or
+            have no times.
+        intensities: reflectance as the sensor gives it, in [0, 1]; None if there is none.
     """
 
     points: Float[Tensor, "n 3"]
@@ -43,18 +43,18 @@ class Scan:
 
 
 class Sequence(ABC):
-    """A drive: scans in the order of time, with ground truth where there is one.
+    """A drive: its scans in order of time, and its ground truth if there is any.
 
-    Opening a sequence finds its files and reads poses and times; scans are read one by one, so that a sequence is
-    cheap to pickle into worker processes.
+    Opening a sequence finds its files and reads poses and times. Scans are read one by one, so that a sequence is cheap
+    to pickle to worker processes.
 
     Attributes:
         name: as on the command line, e.g. "08".
-        T_world_lidar: ground-truth poses (n, 4, 4), float64, the first one the identity; None where there are none.
-        timestamps: seconds of each scan (n,), float64; None where unknown.
+        T_world_lidar: ground-truth poses (n, 4, 4), float64; the first one is the identity. None if there are none.
+        timestamps: time of each scan [s] (n,), float64; None if unknown.
         T_reference_lidar: (4, 4) float64, from the LiDAR to the frame in which the data set publishes its poses and
             its metric is defined: the left camera for KITTI odometry, the LiDAR itself (identity) elsewhere.
-        reference_frame: the name of that frame, "camera" or "lidar".
+        reference_frame: name of that frame, "camera" or "lidar".
     """
 
     name: str
@@ -76,10 +76,10 @@ class Sequence(ABC):
         """
 
     def first_returns(self) -> Scan:
-        """The first scan with a return, almost always the first of all.
+        """The first scan that has a return, almost always the very first.
 
         Raises:
-            UserError: no scan has any.
+            UserError: no scan has a return.
         """
         found = next((scan for scan in self if len(scan.points)), None)
         if found is None:
@@ -90,10 +90,10 @@ class Sequence(ABC):
         return found
 
     def require_contract(self, first: Scan) -> None:
-        """Raise a UserError unless poses, times and a scan are what is said above: not every reader is ours.
+        """Raise a UserError unless poses, timestamps and a scan have the shapes and types documented above.
 
         Args:
-            first: the first scan, or the first with a return.
+            first: the first scan, or the first one with a return.
         """
         require_poses(self.name, self.T_world_lidar, len(self))
         require_timestamps(self.name, self.timestamps, len(self))
@@ -102,9 +102,9 @@ class Sequence(ABC):
     @property
     @abstractmethod
     def fingerprint(self) -> str:
-        """Changes whenever a scan would come out differently: settings of the reader, and the files.
+        """Identifies the scans by the settings of the reader and the files: it differs if any scan differs.
 
-        What the code makes of them is not its concern, see `source_digest`.
+        It need not cover the reader's code, which caches identify by `source_digest`.
         """
 
     def __iter__(self) -> Iterator[Scan]:
@@ -113,7 +113,7 @@ class Sequence(ABC):
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a layout check: what was looked at, what was seen, how bad it is."""
+    """One line of a layout check: how bad it is, what was checked, and what was found."""
 
     level: Level
     what: str
@@ -127,7 +127,7 @@ class LayoutReport:
     Args:
         usable: whether the data can be used as configured.
         findings: in the order in which they were made.
-        remedy: what to change where it is not usable; "" where there is nothing better to say than the findings.
+        remedy: what to change if it is not usable; "" if the findings say enough.
     """
 
     usable: bool = True
@@ -135,42 +135,42 @@ class LayoutReport:
     remedy: str = ""
 
     def found(self, what: str, detail: str) -> None:
-        """Note something as it should be."""
+        """Add something that is as it should be."""
         self.findings.append(Finding("found", what, detail))
 
     def odd(self, what: str, detail: str) -> None:
-        """Note something unexpected that does not prevent use."""
+        """Add something unexpected that does not prevent use."""
         self.findings.append(Finding("odd", what, detail))
 
     def missing(self, what: str, detail: str) -> None:
-        """Note something without which the data cannot be used as configured."""
+        """Add something without which the data cannot be used as configured."""
         self.findings.append(Finding("missing", what, detail))
         self.usable = False
 
 
 class DataSet(ABC):
-    """A data set on disk: opens sequences by name and says which serve for training, validation and test.
+    """A data set on disk: opens sequences by name, and divides them into training, validation and test sequences.
 
-    Every data set's constructor takes the arguments below under the same names, so that a setting means the same in
-    each of them; `configs/data/<name>.yaml` holds their values.
+    The constructors of all data sets take the arguments below, so that a setting means the same for each of them;
+    `configs/data/<name>.yaml` holds their values.
 
     Attributes:
-        title: the data set, as its authors call it.
-        digits: to which names that arrive as numbers are filled up.
-        check_opens: whether `check` opens the sequences itself, or has a reason not to; where not, `full_check` does.
+        title: of the data set, as its authors call it.
+        digits: number of digits of a sequence name; names given as numbers are padded with zeros to it.
+        check_opens: whether `check` opens the sequences itself, or must not; otherwise `full_check` opens them.
 
     Args:
-        root: where it lies; `~` is the home folder.
+        root: folder of the data set; `~` is the home folder.
         projection: the image of its sensor.
-        train_sequences: names of the sequences to train on; a single name will do.
-        val_sequences: names of the sequences by which the best checkpoint is chosen.
-        test_sequences: names of the sequences that an evaluation runs.
-        max_frames: keep only the first scans of each sequence; None keeps all.
-        deskew: whether odometries compensate the motion within a scan; only where scans carry times.
+        train_sequences: names of the sequences to train on, or a single name.
+        val_sequences: names of the sequences that select the best checkpoint.
+        test_sequences: names of the sequences to evaluate.
+        max_frames: keep only this many scans at the start of each sequence; None keeps all.
+        deskew: whether odometries compensate the motion within a scan; only for scans with times.
         beam_correction_deg: angle by which each point is rotated to correct the intrinsic calibration [deg].
 
     Raises:
-        UserError: `max_frames` is no number of scans.
+        UserError: `max_frames` is not a number of scans.
     """
 
     title: str
@@ -200,20 +200,20 @@ class DataSet(ABC):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All configured sequences, each once."""
+        """The names of all configured sequences, each once."""
         return tuple(dict.fromkeys((*self.train_sequences, *self.val_sequences, *self.test_sequences)))
 
     def settings_naming(self, name: str) -> str:
-        """The settings in which a sequence is named, for error messages."""
+        """The settings that name a sequence, for error messages."""
         settings = ("train_sequences", "val_sequences", "test_sequences")
         return ", ".join(f"data.{s}" for s in settings if name in getattr(self, s)) or "the name"
 
     def sequences(self, names: Iterable[str]) -> dict[str, Sequence]:
-        """Open several sequences, all of them before work on the first begins; warns where a scan misses the image.
+        """Open several sequences and check the first scan of each; warns if one of these does not fit into the image.
 
         Raises:
-            DataSetNotFoundError, DamagedFileError: see `sequence`; or the first scan of one cannot be read.
-            UserError: none of the scans of one has a return, or it is not what `Sequence` and `Scan` say.
+            DataSetNotFoundError, DamagedFileError: see `sequence`; or a first scan cannot be read.
+            UserError: a sequence has no scan with a return, or violates the contract of `Sequence` and `Scan`.
         """
         opened = {name: self.sequence(name) for name in names}
         first = {name: sequence.first_returns() for name, sequence in opened.items()}
@@ -229,27 +229,27 @@ class DataSet(ABC):
         """Open a sequence.
 
         Raises:
-            DataSetNotFoundError: the sequence is not there.
+            DataSetNotFoundError: the sequence does not exist.
             DamagedFileError: its poses, times or calibration cannot be read.
         """
 
     @abstractmethod
     def check(self) -> LayoutReport:
-        """Describe this copy: found, missing, odd. Of each sequence's scans a few are read at most."""
+        """Describe what this copy holds, lacks, and what looks odd; reads at most a few scans of each sequence."""
 
     def full_check(self) -> LayoutReport:
-        """`check`, and where it misses nothing, whether each configured sequence is what `Sequence` and `Scan` say."""
+        """`check` and, if nothing is missing, whether each sequence keeps the contract of `Sequence` and `Scan`."""
         report = self.check()
         if report.usable and not self.check_opens:
             self.open_all(report)
         return report
 
     def open_all(self, report: LayoutReport) -> None:
-        """Open each configured sequence for a check; add what is wrong with its poses, times and first scan."""
+        """Open each configured sequence for a check; report errors in its poses, times and first scan."""
         for name in self.names:
             try:
                 sequence = self.open_for_check(name)
-                scan = next(iter(sequence), None) or sequence.first_returns()  # which tells that there is none
+                scan = next(iter(sequence), None) or sequence.first_returns()  # which raises the error
                 sequence.require_contract(scan)
                 points = scan.points
                 remark = self.view_remark(name, points) if len(points) else "its first scan has no return"
@@ -260,16 +260,16 @@ class DataSet(ABC):
                     report.odd(name, one_line(remark))
 
     def view_remark(self, name: str, points: Float[Tensor, "n 3"]) -> str | None:
-        """What to say where many points of a sequence's first scan miss the image; None where they do not."""
+        """A warning if many points of a sequence's first scan lie outside the image; None if they do not."""
         return view_remark(name, points, self.projection)
 
     def open_for_check(self, name: str) -> Sequence:
-        """Open a sequence as far as a check can wait for it."""
+        """Open a sequence for a check; subclasses may skip what takes long."""
         return self.sequence(name)
 
     def prepare(self, names: Iterable[str] | None = None) -> None:  # noqa: B027 - most data sets have nothing to do
-        """Make what can be made on the spot (simulated scans); called once, before any sequence is opened.
+        """Make data that can be generated (simulated scans); called once, before any sequence is opened.
 
         Args:
-            names: the sequences that will be opened; None for all of the data set's.
+            names: the sequences that will be opened; None for all configured ones.
         """

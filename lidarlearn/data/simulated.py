@@ -22,15 +22,16 @@ from lidarlearn.simulation.trajectories import read_poses
 from lidarlearn.simulation.worlds import PRESETS
 
 _SOURCE = "it is simulated on the spot: call prepare(), as train.py and evaluate.py do"
+_REMEDY = "delete the file; it will be made again"
 
 
 class SimulatedSequence(Sequence):
-    """A simulated drive whose range images lie on disk.
+    """A simulated drive whose range images are on disk.
 
     Args:
-        drive: the settings; nothing is simulated as long as its images are there.
+        drive: the settings; nothing is simulated here.
         folder: of the images.
-        frames: number of scans to offer, at most the drive's.
+        frames: number of scans, at most that of the drive.
     """
 
     def __init__(self, drive: Drive, folder: Path, frames: int) -> None:
@@ -54,11 +55,9 @@ class SimulatedSequence(Sequence):
         try:
             ranges = np.load(path)
         except (OSError, ValueError, EOFError) as problem:
-            raise DamagedFileError(path, f"no range image: {problem}", "delete the file; it is made anew") from problem
+            raise DamagedFileError(path, f"no range image: {problem}", _REMEDY) from problem
         if ranges.shape != (self._sensor.beams, self._sensor.columns) or ranges.dtype != np.uint16:
-            raise DamagedFileError(
-                path, f"a {ranges.dtype} array of {ranges.shape}", "delete the file; it is made anew"
-            )
+            raise DamagedFileError(path, f"a {ranges.dtype} array of {ranges.shape}", _REMEDY)
         points, times = self._sensor.points(ranges, index)
         return Scan(torch.from_numpy(points), torch.from_numpy(times) if self._timed else None)
 
@@ -72,34 +71,33 @@ class SimulatedDataSet(DataSet):
     """Drives through simulated worlds, made by `prepare` and kept under a fingerprint of their settings.
 
     A sequence is called `<world>_<number>`, e.g. urban_00; worlds are urban, highway, campus and segway. Each number
-    has a place and a way of its own: different numbers for training, validation and test are different places.
+    has a place and a path of its own, so that different numbers for training, validation and test never share a place.
 
-    The range images lie in `root/simulator_<digest of its code>/<name>_<digest of the settings>`, 131 kB for each scan
-    of 64 beams. A changed simulator makes every drive anew; what earlier ones made lies in the folders beside its own
-    and may be deleted.
+    The range images are in `root/simulator_<digest of its code>/<name>_<digest of the settings>`, 131 kB for each scan
+    of 64 beams. If the simulator changes, all drives are made again; folders of earlier simulators may be deleted.
 
     Args:
-        root: folder of the range images; any two settings can share it.
+        root: folder of the range images; drives of any settings can share it.
         projection: the image of the sensor.
-        sensor: None for the one that belongs to each world.
+        sensor: None for the usual sensor of each world.
         train_sequences: names of the sequences to train on.
-        val_sequences: names of the sequences by which the best checkpoint is chosen.
-        test_sequences: names of the sequences that an evaluation runs.
-        frames: scans of a drive.
+        val_sequences: names of the sequences that select the best checkpoint.
+        test_sequences: names of the sequences to evaluate.
+        frames: number of scans of a drive.
         seed: of all drives.
-        speed: constant speed from the first scan on [m/s]; None drives as one does there.
+        speed: constant speed from the first scan on [m/s]; None for speeds that are usual in the world.
         static: leave out everything that moves.
-        motion_distortion: cast every column from its own pose, and give times with the points.
-        pose_file: path to drive, in KITTI's format, one pose per scan; None makes one for each sequence.
-        pose_file_frame: "camera" for poses of KITTI's left camera, "lidar" for the sensor's own.
-        max_frames: keep only the first scans of each sequence, and make no more; None keeps all.
+        motion_distortion: cast every column from its own pose, and provide times with the points.
+        pose_file: trajectory to drive, in KITTI's format, one pose per scan; None generates one for each sequence.
+        pose_file_frame: "camera" for poses of KITTI's left camera, "lidar" for poses of the sensor.
+        max_frames: make and keep only this many scans at the start of each sequence; None keeps all.
         deskew: whether odometries compensate the motion within a scan; only with `motion_distortion`.
-        beam_correction_deg: there is nothing to correct in simulated scans: must be 0.
-        workers: threads that make scans; None for one per processor, at most 8. Their number changes nothing else.
+        beam_correction_deg: must be 0: simulated beams need no correction.
+        workers: threads that simulate; None for one per processor, at most 8. Does not affect the scans.
     """
 
     title = "simulated"
-    check_opens = True  # there is nothing to open before the scans are made
+    check_opens = True  # scans that are not made yet cannot be opened
 
     def __init__(
         self,
@@ -144,18 +142,17 @@ class SimulatedDataSet(DataSet):
         """Open a sequence.
 
         Raises:
-            DataSetNotFoundError: it was not made yet.
-            UserError: its name is not that of a simulated drive.
+            DataSetNotFoundError: it has not been made yet.
+            UserError: it is not the name of a simulated drive.
         """
         drive = self._drive(name)
-        folder, frames = self.folder(drive), self._wanted(drive)
-        missing = missing_images(folder, range(frames))
-        if missing:
+        folder = self.folder(drive)
+        if missing := self._missing(drive):
             raise DataSetNotFoundError(self.title, f"scan {missing[0]} of sequence {name}", folder, _SOURCE)
-        return SimulatedSequence(drive, folder, frames)
+        return SimulatedSequence(drive, folder, self._frames_of(drive))
 
     def check(self) -> LayoutReport:
-        """Which sequences were made already; those that were not can be made at any time."""
+        """Report which sequences are already made; the others can be made at any time."""
         report = LayoutReport()
         for name in self.names:
             try:
@@ -163,32 +160,35 @@ class SimulatedDataSet(DataSet):
             except UserError as problem:
                 report.missing(name, one_line(problem))
                 continue
-            frames = self._wanted(drive)
-            made = frames - len(missing_images(self.folder(drive), range(frames)))
+            frames = self._frames_of(drive)
+            made = frames - len(self._missing(drive))
             note = report.found if made == frames else report.odd
             note(name, f"{made} of {frames} scans in {self.folder(drive)}" + ("" if made == frames else "; " + _SOURCE))
         return report
 
     def prepare(self, names: Iterable[str] | None = None) -> None:
-        """Make the scans that are missing and show the progress; safe when two processes do it, or one is killed."""
+        """Make the missing scans, showing progress; safe if two processes do so at once, or if one is killed."""
         drives = [self._drive(name) for name in (self.names if names is None else dict.fromkeys(names))]
-        if not any(missing_images(self.folder(drive), range(self._wanted(drive))) for drive in drives):
+        if not any(self._missing(drive) for drive in drives):
             return
         writable(self.root, "data.root=/path/with/room, or the environment variable LIDARLEARN_DATA")
         with locked(self.root / "simulation.lock", f"{self.root}: waiting for another process that simulates"):
-            missing = [(d, self.folder(d), missing_images(self.folder(d), range(self._wanted(d)))) for d in drives]
-            jobs = [job for job in missing if job[2]]
+            # looked up again: the other process may have made them meanwhile
+            jobs = [(drive, self.folder(drive), indices) for drive in drives if (indices := self._missing(drive))]
             for drive, _, _ in jobs:
                 self._describe(drive)
             if jobs:
                 make_images(jobs, self.workers)
 
     def folder(self, drive: Drive) -> Path:
-        """Where the range images of a drive lie: with all that the same code of the simulator made."""
+        """Folder of the range images of a drive, among those made by the same code of the simulator."""
         return self.root / f"simulator_{simulator_digest()}" / f"{drive.name}_{drive.fingerprint}"
 
-    def _wanted(self, drive: Drive) -> int:
+    def _frames_of(self, drive: Drive) -> int:
         return len(drive) if self.max_frames is None else min(len(drive), self.max_frames)
+
+    def _missing(self, drive: Drive) -> list[int]:
+        return missing_images(self.folder(drive), range(self._frames_of(drive)))
 
     def _drive(self, name: str) -> Drive:
         match = re.fullmatch(r"([a-z]+)_(\d+)", name)
@@ -211,7 +211,7 @@ class SimulatedDataSet(DataSet):
         )
 
     def _describe(self, drive: Drive) -> None:
-        """Write beside the images how they came about, for people who wonder."""
+        """Write the settings beside the images, for people."""
         folder = self.folder(drive)
         folder.mkdir(parents=True, exist_ok=True)
         settings = {"world": drive.world_name, "seed": drive.seed, "frames": len(drive), "sensor": drive.sensor.name}

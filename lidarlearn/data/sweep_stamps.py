@@ -1,4 +1,4 @@
-"""The times of sweeps, from the stamps of their messages and the times of their points."""
+"""Times of sweeps, from the stamps of their messages and the times of their points."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -8,23 +8,23 @@ from jaxtyping import Float
 from torch import Tensor
 
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
-_LEAST, _MOST = 0.15, 1.5  # that a sweep lasts, in periods
+_SHORTEST, _LONGEST = 0.15, 1.5  # duration of a sweep, in scan periods
 
 
 def ascending(stamps: Sequence[float]) -> list[int]:
-    """Indices of as many stamps as possible that ascend from one to the next; 0 stands for no stamp, as in ROS."""
-    ends: list[float] = []  # least stamp with which so many can end
-    at_ends: list[int] = []
-    before: dict[int, int] = {}
+    """Indices of the longest strictly ascending subsequence of stamps; 0 stands for no stamp, as in ROS."""
+    last_stamps: list[float] = []  # smallest last stamp of the subsequences of each length
+    last_indices: list[int] = []
+    previous: dict[int, int] = {}  # index before each one in its subsequence, -1 for none
     for index, stamp in enumerate(stamps):
         if stamp == 0:
             continue
-        length = bisect_left(ends, stamp)
-        ends[length : length + 1], at_ends[length : length + 1] = [stamp], [index]
-        before[index] = at_ends[length - 1] if length else -1
-    chosen = at_ends[-1:]
-    while chosen and before[chosen[-1]] >= 0:
-        chosen.append(before[chosen[-1]])
+        length = bisect_left(last_stamps, stamp)
+        last_stamps[length : length + 1], last_indices[length : length + 1] = [stamp], [index]
+        previous[index] = last_indices[length - 1] if length else -1
+    chosen = last_indices[-1:]
+    while chosen and previous[chosen[-1]] >= 0:
+        chosen.append(previous[chosen[-1]])
     return chosen[::-1]
 
 
@@ -33,8 +33,8 @@ class SweepClock:
     """How the times of points relate to those of scans.
 
     Args:
-        middle_s: how long after its message's stamp the middle of a sweep is [s].
-        shares_per_unit: of the scan period, in a unit of the points' times; None where that is unknown.
+        middle_s: time from the stamp of the message to the middle of the sweep [s].
+        shares_per_unit: scan periods per unit of the points' times; None if the unit is unknown.
     """
 
     middle_s: float = 0.0
@@ -42,44 +42,45 @@ class SweepClock:
 
 
 def unit_s(times: Float[Tensor, "n"], period_s: float) -> float | None:
-    """The unit of points' times, s, ms, us or ns, in which a sweep lasts for a good part of a period; else None.
+    """The unit [s] of points' times, s, ms, us or ns, in which a sweep lasts for a good part of the period; else None.
 
-    A sensor may look into a part of the circle; a hundredth of it is rather times of another unit, or shares already.
+    A sensor may scan only a part of the circle. A sweep that seems to last for a hundredth of the period, however, has
+    times in another unit, or shares of the period.
 
     Args:
         times: of the points, not all the same.
-        period_s: from scan to scan.
+        period_s: time from scan to scan [s].
     """
     span = float(times.max() - times.min())
-    return next((unit for unit in _UNITS_S if _LEAST * period_s <= span * unit <= _MOST * period_s), None)
+    return next((unit for unit in _UNITS_S if _SHORTEST * period_s <= span * unit <= _LONGEST * period_s), None)
 
 
 def sweep_clock(
     times: Float[Tensor, "n"] | None, stamp_s: float | None, period_s: float | None, usual_period_s: float
 ) -> SweepClock:
-    """Read the clock of points' times off one sweep.
+    """Derive the clock of the points' times from one sweep.
 
-    They are relative to the message's stamp, or of the same clock; where they are of another one, the stamp is taken
-    for the first point's.
+    Their times are relative to the stamp of the message, or absolute on the same clock. If they are on another clock,
+    the stamp is taken to be the time of the first point.
 
     Args:
-        times: of the points, in any unit; None where they have none.
-        stamp_s: of the message [s]; None for the time at which it was recorded: after the last point.
-        period_s: from scan to scan; None where there is but one.
-        usual_period_s: of such a one.
+        times: of the points, in any unit; None if they have none.
+        stamp_s: of the message [s]; None if only the time of recording is known, which is after the last point.
+        period_s: time from scan to scan [s]; None if there is only one scan.
+        usual_period_s: taken instead in that case [s].
     """
-    longest_s = period_s or usual_period_s
-    if times is None or not varied(times) or (unit := unit_s(times, longest_s)) is None:
+    expected_s = period_s or usual_period_s
+    if times is None or not varied(times) or (unit := unit_s(times, expected_s)) is None:
         return SweepClock()
     first_s, last_s = float(times.min()) * unit, float(times.max()) * unit
     shares_per_unit = None if period_s is None else unit / period_s
     if stamp_s is None:
         return SweepClock(-(last_s - first_s) / 2, shares_per_unit)
     middle_s = (first_s + last_s) / 2
-    near = (middle_s - origin for origin in (0.0, stamp_s) if abs(middle_s - origin) <= _MOST * longest_s)
+    near = (middle_s - origin for origin in (0.0, stamp_s) if abs(middle_s - origin) <= _LONGEST * expected_s)
     return SweepClock(next(near, (last_s - first_s) / 2), shares_per_unit)
 
 
 def varied(times: Float[Tensor, "n"]) -> bool:
-    """Whether times differ from each other: drivers that know none write zeros."""
+    """Whether times differ from each other; drivers without times write zeros."""
     return bool((times != times[:1]).any())

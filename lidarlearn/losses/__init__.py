@@ -1,1 +1,1 @@
-"""What PoseNet is trained to minimize: projective point-to-plane losses, and the distance to ground truth."""
+"""The losses of PoseNet: projective point-to-plane alignment, and the distance to ground truth."""

@@ -8,11 +8,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class LossResult:
-    """A loss and what it was made of.
+    """A loss and quantities to log beside it.
 
     Args:
         loss: mean over the batch, differentiable.
-        parts: what to watch besides, by name with its unit, without gradient.
+        parts: quantities to log, by name with unit, without gradient.
     """
 
     loss: Float[Tensor, ""]

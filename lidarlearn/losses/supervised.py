@@ -1,4 +1,4 @@
-"""Supervised training: distance to the true relative pose, translation against rotation weighed by learning."""
+"""Supervised training: distance to the true relative pose, with learned weights of translation and rotation."""
 
 import torch
 from jaxtyping import Float
@@ -11,15 +11,15 @@ from lidarlearn.losses.result import LossResult
 class SupervisedLoss(nn.Module):
     """|t_gt - t|^2 e^{s1} + |e_gt - e|^2 e^{s2} - (s1 + s2) with learned s1, s2.
 
-    For a given mean squared error m the best s is -ln m: the network learns the precision of either half, and each
-    contributes about one whatever its unit. The price is a loss without lower bound, which falls by ln(1/m) for ever
-    as the errors do (its sign means nothing, only its course). On a pair learned by heart s would grow until e^s
-    overflows, hence the largest precision; in training s is put back to it, from where it can fall again.
+    For a mean squared error m the optimal s is -ln m, so that each term contributes about one whatever its unit. The
+    price is a loss without a lower bound, which keeps falling by ln(1/m) as the errors do: only its course is
+    meaningful, not its sign. On memorized pairs s would grow until e^s overflows, so training clamps it to `max_s`,
+    from where it can fall again.
 
     Args:
-        initial_s1: s1 at the start; 0 suits errors of a metre.
-        initial_s2: s2 at the start; 6 suits errors of 0.05 rad.
-        max_s: s grows no larger; 14 stands for errors of 1 mm and 1 mrad.
+        initial_s1: initial s1; 0 suits errors of a metre.
+        initial_s2: initial s2; 6 suits errors of 0.05 rad.
+        max_s: upper bound of both; 14 corresponds to errors of 1 mm and 1 mrad.
 
     Source: Dellenbach et al. 2021, III-B "Supervised training", after LO-Net (Li et al., CVPR 2019).
     """

@@ -11,12 +11,12 @@ from lidarlearn.losses.projective import ProjectiveLoss
 class WeightedIcpLoss(ProjectiveLoss):
     """Weighted squared point-to-plane distance: rho = w r^2 with w = exp(-|p - q|^2 / sigma^2).
 
-    The weight says how far an association is to be believed and is held fixed under differentiation, as in the
-    registration's iteratively reweighted least squares. With a gradient through it, a correspondence farther than
-    sigma would lower its cost by moving away: trained on KITTI 04 that loss settles on no motion at all.
+    The weight expresses confidence in an association. It has no gradient, as in the iteratively reweighted least
+    squares of the registration: otherwise a correspondence farther apart than sigma would lower its cost by moving
+    away. Trained on KITTI 04 with that gradient, the network settles on no motion at all.
 
     Args:
-        sigma_m: distance at which an association counts 1/e [m].
+        sigma_m: distance at which an association weighs 1/e [m].
         normal_window: rows and columns of the neighbourhood of reference normals [px], odd.
         max_range_jump: see `normal_map`.
         max_roughness: see `normal_map`.

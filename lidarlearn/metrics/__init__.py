@@ -1,1 +1,1 @@
-"""How far an estimated trajectory is from the truth: KITTI's segments, absolute and relative errors, failures."""
+"""Errors of estimated trajectories: KITTI's segments, absolute and relative pose errors, failures."""

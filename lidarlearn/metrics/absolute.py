@@ -1,4 +1,4 @@
-"""Absolute pose error: what is left of the distance between two trajectories after the best rigid alignment."""
+"""Absolute pose error (APE): distance between two trajectories after the best rigid alignment."""
 
 import torch
 from jaxtyping import Float
@@ -9,9 +9,9 @@ from lidarlearn.metrics.checks import check_comparable
 
 
 def align(points_target: Float[Tensor, "n 3"], points_source: Float[Tensor, "n 3"]) -> Float[Tensor, "4 4"]:
-    """`T_target_source` that brings corresponding points closest in the least-squares sense, without scale.
+    """`T_target_source` that aligns corresponding points best in the least-squares sense, without scale.
 
-    Points on a line or in one place leave rotations free; one of the best is returned, always a proper rotation.
+    Points on a line or in one place do not determine the rotation: one of the best is returned, always a proper one.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
     """
@@ -35,6 +35,6 @@ def absolute_errors(T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Te
 
 
 def ape_rmse(T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Tensor, "m 4 4"]) -> float | None:
-    """Root mean square of `absolute_errors` [m]; None for fewer than two poses, which any alignment fits."""
+    """Root mean square of `absolute_errors` [m]; None for fewer than two poses, which always align."""
     errors = absolute_errors(T_estimate, T_ground_truth)
     return float(errors.square().mean().sqrt()) if len(errors) > 1 else None

@@ -1,4 +1,4 @@
-"""What every metric asks of the two trajectories it compares."""
+"""The check of two trajectories that every metric begins with."""
 
 import torch
 from jaxtyping import Float
@@ -6,10 +6,10 @@ from torch import Tensor
 
 
 def check_comparable(T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Tensor, "m 4 4"]) -> None:
-    """Two trajectories can be compared pose by pose.
+    """Check that two trajectories can be compared pose by pose.
 
     Raises:
-        ValueError: their numbers of poses differ, they are not in double precision, or hold values that are not finite.
+        ValueError: the numbers of poses differ, poses are not in double precision, or are not finite.
     """
     if len(T_estimate) != len(T_ground_truth):
         raise ValueError(f"{len(T_estimate)} estimated poses against {len(T_ground_truth)} of the ground truth")

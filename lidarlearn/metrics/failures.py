@@ -1,4 +1,4 @@
-"""Registration failures: motions between consecutive scans that are grossly wrong."""
+"""Registration failures: grossly wrong motions between consecutive scans."""
 
 import math
 
@@ -19,15 +19,15 @@ def registration_failures(
     max_translation_m: float = MAX_TRANSLATION_M,
     max_rotation_deg: float = MAX_ROTATION_DEG,
 ) -> Bool[Tensor, "p"]:
-    """Which motions between consecutive scans are off by more than a metre or three degrees.
+    """Whether each motion between consecutive scans is off by more than a metre or three degrees.
 
-    Rotations are compared as vectors of Euler angles, as the paper does, not by the angle between them.
+    Rotations are compared as vectors of Euler angles, as in the paper, not by the angle between them.
 
     Args:
         T_estimate: absolute poses of the LiDAR.
         T_ground_truth: the same number of poses.
-        max_translation_m: a greater error of the translation is a failure.
-        max_rotation_deg: a greater norm of the Euler angles' difference is a failure.
+        max_translation_m: largest error of the translation that is not a failure.
+        max_rotation_deg: largest norm of the difference of Euler angles that is not a failure.
 
     Raises:
         ValueError: the numbers of poses differ, or poses are not finite.

@@ -1,7 +1,7 @@
 """KITTI's odometry metric: drift over segments of 100 to 800 m, as a share of their length.
 
 Source: Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012, and the benchmark's development kit.
-The kit holds distances and the cosine of the rotation error in single precision; here everything is double.
+The kit keeps distances and the cosine of the rotation error in single precision; here everything is double.
 """
 
 import math
@@ -36,7 +36,7 @@ class SegmentErrors:
 
 @dataclass(frozen=True)
 class SegmentAverage:
-    """Mean over segments, in the units in which the benchmark publishes it."""
+    """Mean over segments, in the units of the benchmark's tables."""
 
     segments: int
     translation_percent: float
@@ -50,10 +50,10 @@ def path_distances(T_world: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n"]:
 
 
 def segment_errors(T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Tensor, "m 4 4"]) -> SegmentErrors:
-    """Relative errors over all segments: starts every ten frames, each of the eight lengths that the path still holds.
+    """Relative errors over all segments: one for every tenth frame and each of the eight lengths the path still holds.
 
-    A segment ends at the first frame strictly farther than its nominal length along the ground truth. The inverses are
-    those of general matrices: published poses are rotations to seven digits only, and a transpose would show.
+    A segment ends at the first frame strictly farther than its nominal length along the ground truth. Matrices are
+    inverted in general: published poses are rotations to seven digits only, for which a transpose would differ visibly.
 
     Args:
         T_estimate: absolute poses in the frame in which the data set defines its metric (KITTI: the left camera).
@@ -75,7 +75,7 @@ def segment_errors(T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Ten
 
 
 def average(errors: SegmentErrors) -> SegmentAverage | None:
-    """Mean error over all segments; None where the path is too short for any."""
+    """Mean error over all segments; None if the path is too short for any."""
     if not len(errors.length_m):
         return None
     return SegmentAverage(
@@ -86,13 +86,9 @@ def average(errors: SegmentErrors) -> SegmentAverage | None:
 
 
 def average_by_length(errors: SegmentErrors) -> dict[int, SegmentAverage]:
-    """Mean error over the segments of each nominal length [m] of which there are any."""
-    averages = {}
-    for length in SEGMENT_LENGTHS_M:
-        mean = average(_select(errors, errors.length_m == length))
-        if mean is not None:
-            averages[length] = mean
-    return averages
+    """Mean error over the segments of each nominal length [m]; lengths without segments are left out."""
+    averages = {length: average(_select(errors, errors.length_m == length)) for length in SEGMENT_LENGTHS_M}
+    return {length: mean for length, mean in averages.items() if mean is not None}
 
 
 def _segments(distances: Float[Tensor, "n"]) -> tuple[Int[Tensor, "s"], Int[Tensor, "s"], Float[Tensor, "s"]]:

@@ -1,4 +1,4 @@
-"""Relative pose error: how far each motion between consecutive scans is from the true one."""
+"""Relative pose error (RPE): errors of the motions between consecutive scans."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from lidarlearn.metrics.checks import check_comparable
 
 @dataclass(frozen=True)
 class RelativeErrors:
-    """Error of each motion between consecutive scans; entry i is about scans i and i + 1.
+    """Error of each motion between consecutive scans; entry i belongs to scans i and i + 1.
 
     Args:
         translation: length of the error's translation [m].
@@ -32,10 +32,10 @@ class RelativePoseError:
 
 
 def relative_errors(T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Tensor, "m 4 4"]) -> RelativeErrors:
-    """Translation and angle of `T_i_(i+1)`, the true one inverted times the estimated one, of all consecutive pairs.
+    """Translation and angle of the inverse of the true `T_i_(i+1)` times the estimated one, for all consecutive pairs.
 
-    The angle is taken by the logarithm: the arc cosine of a trace is blind below 1e-4 rad in single precision and
-    noisy above it on poses with few digits.
+    The angle is that of the logarithm: the arc cosine of the trace is zero below 1e-4 rad in single precision, and
+    noisy above it for poses with few digits.
 
     Raises:
         ValueError: the numbers of poses differ, or poses are not finite.
@@ -48,7 +48,7 @@ def relative_errors(T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Te
 def relative_pose_error(
     T_estimate: Float[Tensor, "n 4 4"], T_ground_truth: Float[Tensor, "m 4 4"]
 ) -> RelativePoseError | None:
-    """RPE over all consecutive pairs; None where there is no pair."""
+    """RPE over all consecutive pairs; None if there are none."""
     errors = relative_errors(T_estimate, T_ground_truth)
     if not len(errors.translation):
         return None
@@ -64,7 +64,7 @@ def relative_translation_error(
 ) -> float | None:
     """Mean error of the translation between consecutive scans as a share of the mean motion; None without motion.
 
-    Defined on drives of any length, where KITTI's metric needs 100 m: 0 is perfect, 1 is what standing still scores.
+    Unlike KITTI's metric it is also defined for drives under 100 m. 0 is perfect; standing still scores 1.
     """
     check_comparable(T_estimate, T_ground_truth)
     true = se3.relative(T_ground_truth)[:, :3, 3]
@@ -74,7 +74,7 @@ def relative_translation_error(
 
 
 def speeds(T_world: Float[Tensor, "n 4 4"], timestamps: Float[Tensor, "n"]) -> Float[Tensor, "m"]:
-    """Speed between consecutive poses [m/s]; pairs whose time [s] does not advance are left out."""
+    """Speed between consecutive poses [m/s]; pairs whose timestamps [s] do not ascend are left out."""
     elapsed = timestamps.diff()
     motion = T_world[:, :3, 3].diff(dim=0).norm(dim=-1)
     return motion[elapsed > 0] / elapsed[elapsed > 0]

@@ -13,7 +13,7 @@ from lidarlearn.geometry.projection import activated
 Backbone = Literal["resnet18", "resnet34", "resnet50"]
 Encoding = Literal["maps", "difference"]
 
-INITIAL_HEAD_STD = 1e-3  # the untrained network says "hardly any motion", from where projective association works
+INITIAL_HEAD_STD = 1e-3  # an untrained network predicts almost no motion, for which projective association works
 
 
 class PoseNet(nn.Module):
@@ -23,16 +23,16 @@ class PoseNet(nn.Module):
 
     Args:
         backbone: one of torchvision's residual networks, with random weights.
-        encoding: "maps" stacks the two vertex maps as in the paper. "difference" puts in the target's place what it
-            differs by from the reference: motion moves points by decimetres that lie tens of metres away, and a network
-            that gets only the two positions spends most of a short training on learning to subtract them (simulated
-            town, 3 epochs: 54 % of the motion wrong as against 20 %).
-        input_scale_m: coordinates are divided by this, so that the network sees numbers around one [m].
-        difference_scale_m: length at which a difference counts half of what it can at most [m]; beyond, it stands for
-            a change of surface rather than for motion. Of no effect on "maps".
+        encoding: "maps" stacks the two vertex maps as in the paper. "difference" replaces the target by its difference
+            from the reference: motion moves points tens of metres away by decimetres, and a network that gets only the
+            two positions spends most of a short training on learning to subtract them (simulated town, 3 epochs: an
+            error of 54 % of the motion instead of 20 %).
+        input_scale_m: coordinates are divided by this, so that inputs are around one [m].
+        difference_scale_m: length at which a difference reaches half of its bound [m]; longer ones are due to a change
+            of surface rather than to motion. Has no effect on "maps".
         rotation_scale: factor of the rotation head. Angles between scans are an order of magnitude smaller than
-            translations in metres; without the factor early steps rotate scans out of each other's view.
-        wrap_columns: pad convolutions with the columns from beyond the seam instead of zeros.
+            translations in metres; without the factor, early steps rotate scans out of each other's view.
+        wrap_columns: pad convolutions with the columns beyond the seam instead of zeros.
 
     Source: Dellenbach et al. 2021, III-B "Deep LiDAR Odometries": ResNet-18, Euler angles.
     """
@@ -83,7 +83,7 @@ class PoseNet(nn.Module):
 def bounded_difference(
     reference: Float[Tensor, "batch 3 h w"], target: Float[Tensor, "batch 3 h w"], scale_m: float
 ) -> Float[Tensor, "batch 3 h w"]:
-    """Target minus reference, pixel by pixel, as d / (scale + |d|): shorter than one; zero where either is empty."""
+    """Target minus reference per pixel as d / (scale + |d|), which is shorter than one; zero where either is empty."""
     both = (activated(reference) & activated(target))[:, None]
     d = torch.where(both, target - reference, 0.0)
     return d / (scale_m + d.norm(dim=1, keepdim=True))
@@ -100,7 +100,7 @@ class ColumnWrappedConv2d(nn.Conv2d):
 
 
 def _wrap_columns(network: nn.Module) -> None:
-    """Replace every padded convolution by one that wraps its columns; parameters keep their names and values."""
+    """Replace all padded convolutions by ones that wrap columns; parameters keep their names and values."""
     for name, child in network.named_children():
         if isinstance(child, nn.Conv2d) and int(child.padding[1]) > 0:
             wrapped = ColumnWrappedConv2d(
