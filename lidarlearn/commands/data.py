@@ -62,23 +62,23 @@ def check(overrides: Sequence[str], console: Console, config_folder: str | None 
 def export_all(overrides: Sequence[str], console: Console, config_folder: str | None = None) -> bool:
     """Write the sequences of one data set in the format of another, and print the command that trains on them."""
     # imported late: a check does not need the libraries of the writers
-    from lidarlearn.data.export.formats import export, format_of, require_new
+    from lidarlearn.data.export.formats import exporter_of
 
     suffix = next((o.removeprefix("suffix=") for o in overrides if o.startswith("suffix=")), None)
     theirs_alone = ("to=", "to.", "projection@to.")
     of_target = [re.sub(r"^(projection@)?to\b", r"\1data", o) for o in overrides if o.startswith(theirs_alone)]
     of_source = [o for o in overrides if not o.startswith((*theirs_alone, "suffix="))]
     source, target = (compose_data_set(side, config_folder) for side in (of_source, of_target))
-    form = format_of(target, suffix)
+    exporter = exporter_of(target, suffix)
     theirs = matched_names(source, target)
     for name in theirs.values():
-        require_new(target, name)
+        exporter.require_new(name)
     source.prepare(theirs)
     drives = source.sequences(theirs)
     for mine, drive in drives.items():  # all of them first: half an export would block the next attempt
-        form.require(drive, target, theirs[mine])
+        exporter.require(drive, theirs[mine])
     for mine, drive in drives.items():
-        export(drive, target, theirs[mine], suffix)
+        exporter.export(drive, theirs[mine])
         console.print(f"{mine} -> {theirs[mine]}: {len(drive)} scans", markup=False)
     if left_out := [name for name in source.names if name not in theirs]:
         console.print(f"left out, {target.title} has no more names for them: {', '.join(left_out)}", markup=False)

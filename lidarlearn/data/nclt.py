@@ -94,6 +94,8 @@ class Nclt(DataSetOnDisk):
             root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
         )
         self.sensor_height_m = float(sensor_height_m)
+        self.T_files_lidar = FLIP.clone()
+        self.T_files_lidar[2, 3] = -self.sensor_height_m
 
     def sequence(self, name: str) -> NcltSequence:
         """Open a drive; scans before and after its ground truth are left out."""
@@ -151,10 +153,8 @@ class Nclt(DataSetOnDisk):
         return next((path for path in candidates if path.is_file()), None)
 
     def _poses(self, truth: StampedPoses, timestamps: Float[Tensor, "n"]) -> Float[Tensor, "n 4 4"]:
-        T_files_lidar = FLIP.clone()
-        T_files_lidar[2, 3] = -self.sensor_height_m
         T_world_files = interpolate_poses(truth.timestamps, truth.T_world_body, timestamps)
-        return start_at_identity(T_world_files @ T_files_lidar)
+        return start_at_identity(T_world_files @ self.T_files_lidar)
 
 
 def read_ground_truth(path: Path) -> StampedPoses:

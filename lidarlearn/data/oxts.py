@@ -67,6 +67,18 @@ def read_timestamps(path: Path, numbers: list[int]) -> Float[Tensor, "n"]:
     return torch.from_numpy(stamps.astype(np.int64) * 1e-9)
 
 
+def write_timestamps(path: Path, day: np.datetime64, seconds: Float[Tensor, "n"]) -> None:
+    """Write dates with nanoseconds, one a line.
+
+    Args:
+        path: of the file.
+        day: of the recording, which begins at noon.
+        seconds: of each line, from noon.
+    """
+    stamps = day + np.timedelta64(12, "h") + np.round(seconds.numpy() * 1e9).astype("timedelta64[ns]")
+    path.write_text("".join(f"{str(stamp).replace('T', ' ')}\n" for stamp in stamps), encoding="utf-8")
+
+
 def read_rigid_transform(path: Path) -> Float[Tensor, "4 4"]:
     """The transform of a calibration file with lines `R:` (nine numbers) and `T:` (three), as in calib_imu_to_velo.txt.
 

@@ -181,6 +181,11 @@ def transforms_from_euler(position: NDArray[np.float64], roll_pitch_yaw: NDArray
     return se3.from_rotation_translation(torch.from_numpy(R), torch.from_numpy(position))
 
 
+def euler_from_transforms(T: Float[Tensor, "n 4 4"]) -> NDArray[np.float64]:
+    """Roll, pitch and yaw [rad] (n, 3), the inverse of `transforms_from_euler`."""
+    return Rotation.from_matrix(T[:, :3, :3].numpy()).as_euler("ZYX")[:, ::-1]
+
+
 def as_transforms(top: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 4 4"]:
     """4x4 matrices from their upper three rows."""
     bottom = torch.zeros_like(top[..., :1, :])

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lidarlearn.commands.data import compose_data_set, data_groups, main, matched_names
-from lidarlearn.data.export.formats import export, format_of
+from lidarlearn.data.export.formats import exporter_of
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
@@ -44,6 +44,10 @@ def simulated(sensor, distorted, frames=FRAMES):
 
 def target_of(name, root):
     return compose_data_set([f"data={name}", f"data.root={root}"])
+
+
+def export(drive, target, name, suffix=None):
+    exporter_of(target, suffix).export(drive, name)
 
 
 def by_place(points, *others):
@@ -288,7 +292,7 @@ def test_what_cannot_be_written_is_said_with_what_can(arguments, said, tmp_path,
 
 def test_the_options_named_in_the_advice_are_options():
     with pytest.raises(UserError) as error:
-        format_of(target_of("simulated_urban", "x"))
+        exporter_of(target_of("simulated_urban", "x"))
     options = str(error.value).split("to=")[1].split("|")
     assert len(options) == 7 and set(options) <= set(data_groups())
 

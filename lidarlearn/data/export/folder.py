@@ -6,52 +6,60 @@ import numpy as np
 from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
-from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.export.drives import period_of, scans_of, timestamps_of
-from lidarlearn.data.export.kitti import matrix_row
+from lidarlearn.data.export.exporter import PERIOD_S, Exporter, timestamps_of
 from lidarlearn.data.folder import Folder
 from lidarlearn.data.ply import write_ply
-from lidarlearn.data.sequence import Sequence
+from lidarlearn.data.pose_files import write_kitti_poses, write_times
+from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.errors import UserError
 
 
-def require_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd") -> None:
-    """Raise UserError where points have times, and files of the suffix hold none."""
-    if suffix in (".bin", ".npy") and drive.first_returns().times is not None:
-        raise UserError(
-            f"suffix={suffix}: such files hold no point times, but the scans of {drive.name} have some."
-            "\n  change: suffix=.pcd or suffix=.ply"
-        )
+class FolderExporter(Exporter[Folder]):
+    """Writes scans, times.txt and, if the drive has ground truth, poses.txt with the LiDAR's own poses.
 
-
-def write_folder(drive: Sequence, target: Folder, name: str, suffix: str = ".pcd") -> None:
-    """Scans, times.txt and, where the drive has ground truth, poses.txt with the LiDAR's own poses.
-
-    .pcd and .ply hold intensities and point times [s from the first point on] where the drive has them, .bin and .npy
+    .pcd and .ply hold intensities and point times [s from the first point on] if the drive has them, .bin and .npy
     x, y, z, intensity.
 
     Args:
-        drive: what is written.
         target: the folder of folders.
-        name: of the folder.
-        suffix: .bin, .npy, .pcd or .ply.
+        suffix: of the scans: .bin, .npy, .pcd or .ply.
     """
-    folder = target.root / name
-    folder.mkdir(parents=True, exist_ok=True)
-    period_s = period_of(drive)
-    for index, scan in enumerate(scans_of(drive, name)):
-        x, y, z = raise_beams(scan.points, -target.beam_correction_deg).numpy().T
-        fields: dict[str, NDArray[np.float32]] = {"x": x, "y": y, "z": z}
+
+    option = "folder"
+    places = ("{}", "{}.txt", "{}.tum")
+
+    def __init__(self, target: Folder, suffix: str = ".pcd") -> None:
+        super().__init__(target)
+        self.suffix = suffix
+
+    def require(self, drive: Sequence, name: str) -> None:
+        """Point times need files that hold them."""
+        if self.suffix in (".bin", ".npy") and drive.first_returns().times is not None:
+            raise UserError(
+                f"suffix={self.suffix}: such files hold no point times, but the scans of {drive.name} have some."
+                "\n  change: suffix=.pcd or suffix=.ply"
+            )
+
+    def write(self, drive: Sequence, name: str) -> None:
+        """Write scans, times and poses."""
+        folder = self.target.root / name
+        folder.mkdir(parents=True, exist_ok=True)
+        timestamps = timestamps_of(drive)
+        period_s = float(timestamps.diff().median()) if len(drive) > 1 else PERIOD_S
+        for index, scan in enumerate(self.scans(drive, name)):
+            _write(folder / f"{index:06d}{self.suffix}", self._fields(scan, period_s), self.target.bin_columns)
+        write_times(folder / "times.txt", timestamps)
+        if drive.T_world_lidar is not None:
+            write_kitti_poses(folder / "poses.txt", drive.T_world_lidar)
+
+    def _fields(self, scan: Scan, period_s: float) -> dict[str, NDArray[np.float32]]:
+        """What is known of each point, by the name of its field."""
+        fields: dict[str, NDArray[np.float32]] = dict(zip("xyz", scan.points.numpy().T, strict=True))
         if scan.intensities is not None:
-            fields["intensity"] = scan.intensities.numpy() * np.float32(target.max_intensity or 1.0)
+            fields["intensity"] = scan.intensities.numpy() * np.float32(self.target.max_intensity or 1.0)
         if scan.times is not None:
             fields["t"] = ((scan.times - scan.times.min()) * period_s).numpy()
-        _write(folder / f"{index:06d}{suffix}", fields, target.bin_columns)
-    (folder / "times.txt").write_text(
-        "".join(f"{time:.9f}\n" for time in timestamps_of(drive).tolist()), encoding="utf-8"
-    )
-    if drive.T_world_lidar is not None:
-        (folder / "poses.txt").write_text("".join(f"{matrix_row(T)}\n" for T in drive.T_world_lidar), encoding="utf-8")
+        return fields
 
 
 def _write(path: Path, fields: dict[str, NDArray[np.float32]], bin_columns: int) -> None:
@@ -61,12 +69,16 @@ def _write(path: Path, fields: dict[str, NDArray[np.float32]], bin_columns: int)
             cloud.save(path)
         case ".ply":
             write_ply(path, fields)
+        case ".bin":
+            path.write_bytes(_rows(fields, bin_columns).tobytes())
         case _:
-            rows = np.zeros((len(fields["x"]), bin_columns if path.suffix == ".bin" else 4), dtype="<f4")
-            for column, field in enumerate(("x", "y", "z", "intensity")):
-                if field in fields:
-                    rows[:, column] = fields[field]
-            if path.suffix == ".bin":
-                path.write_bytes(rows.tobytes())
-            else:
-                np.save(path, rows)
+            np.save(path, _rows(fields, 4))
+
+
+def _rows(fields: dict[str, NDArray[np.float32]], columns: int) -> NDArray[np.float32]:
+    """x, y, z, intensity of each point; 0 where unknown and in further columns."""
+    rows = np.zeros((len(fields["x"]), columns), dtype="<f4")
+    for column, field in enumerate(("x", "y", "z", "intensity")):
+        if field in fields:
+            rows[:, column] = fields[field]
+    return rows
