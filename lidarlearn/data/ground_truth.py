@@ -1,7 +1,7 @@
-"""Ground truth beside recordings that have no format of their own for it: poses of the LiDAR in KITTI's or TUM's."""
+"""Ground truth of recordings: poses of the LiDAR in KITTI's or TUM's format, in or beside the recording's folder."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from lidarlearn.data.sequence import LayoutReport
 
 _INSIDE = ("poses.txt", "poses.tum", "groundtruth.txt")
 _BESIDE = (".txt", ".tum")
-_SLACK_S = 0.1  # by which a scan may be before the first or after the last pose
+_SLACK_S = 0.1  # a scan may be this long before the first or after the last pose
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class PosedScans:
     """The scans that have a pose.
 
     Args:
-        indices: which of the scans.
-        T_world_lidar: the pose of each, the first one the identity.
+        indices: of the scans.
+        T_world_lidar: pose of each, the first one the identity.
     """
 
     indices: list[int]
@@ -40,7 +40,7 @@ class GroundTruth:
     Args:
         path: of the file.
         T_world_lidar: the poses.
-        timestamps: of TUM's [s], ascending; None for KITTI's, which belong to the scans in order.
+        timestamps: of each pose in TUM's format [s], ascending; None in KITTI's, where rows follow the scans' order.
     """
 
     path: Path
@@ -49,46 +49,55 @@ class GroundTruth:
 
     @property
     def start_s(self) -> float:
-        """Time before which scans are left out; minus infinity where rows belong to the scans in order."""
+        """Scans before this time are left out [s]; minus infinity for KITTI's format."""
         return -math.inf if self.timestamps is None else float(self.timestamps[0]) - _SLACK_S
 
     def of_scans(
-        self, name: str, rows: Sequence[int], count: int | None, timestamps: Float[Tensor, "n"] | None
+        self, name: str, rows: Collection[int], count: int | None, timestamps: Float[Tensor, "n"] | None
     ) -> PosedScans:
-        """KITTI's rows, or TUM's poses at the times of scans; of these, scans that the times do not cover are left out.
-
-        TUM's rows belong to the scans in order, too, where these have no times.
+        """The scans that have a pose: interpolated if poses and scans have times, else the row of each scan.
 
         Args:
             name: of the sequence.
-            rows: the row of each scan where they belong to the scans in order.
-            count: of rows that there have to be then; None where no more is known than that each scan needs one.
-            timestamps: of the scans [s]; None where there are none.
+            rows: the row of each scan, if rows follow the scans' order.
+            count: number of rows there must be then; None if it is enough that every scan has one.
+            timestamps: of the scans [s]; None if unknown.
 
         Raises:
-            DamagedFileError: another number of poses than scans, or no scan within their times.
+            DamagedFileError: the number of poses does not match that of the scans, or their times do not overlap.
         """
         if self.timestamps is None or timestamps is None:
-            there = len(self.T_world_lidar)
-            if there != count and (count is not None or there <= max(rows)):
-                needed = f"{count} scans" if count is not None else f"the first {max(rows) + 1} scans"
-                raise DamagedFileError(self.path, f"{there} poses for {needed}", "give every scan a row or a time")
-            return PosedScans(list(range(len(rows))), start_at_identity(self.T_world_lidar[list(rows)]))
-        if len(self.timestamps) < 2:
+            return self._in_order(rows, count)
+        return self._interpolated(name, self.timestamps, timestamps)
+
+    def _in_order(self, rows: Collection[int], count: int | None) -> PosedScans:
+        there = len(self.T_world_lidar)
+        if there != count and (count is not None or there <= max(rows)):
+            needed = f"{count} scans" if count is not None else f"the first {max(rows) + 1} scans"
+            raise DamagedFileError(self.path, f"{there} poses for {needed}", "give every scan a row or a time")
+        return PosedScans(list(range(len(rows))), start_at_identity(self.T_world_lidar[list(rows)]))
+
+    def _interpolated(self, name: str, times: Float[Tensor, "n"], scan_times: Float[Tensor, "m"]) -> PosedScans:
+        if len(times) < 2:
             raise DamagedFileError(self.path, "a single pose with a time", "give at least two")
-        indices = covered(name, timestamps, self.timestamps, _SLACK_S)
+        indices = covered(name, scan_times, times, _SLACK_S)
         if not indices:
-            raise DamagedFileError(self.path, *_no_overlap(self.timestamps, timestamps))
-        poses = interpolate_poses(self.timestamps, self.T_world_lidar, timestamps[indices])
+            raise DamagedFileError(
+                self.path,
+                f"its times ({times[0]:.3f} to {times[-1]:.3f} s) do not cover those of the scans "
+                f"({scan_times.min():.3f} to {scan_times.max():.3f} s)",
+                "use one clock in both files",
+            )
+        poses = interpolate_poses(times, self.T_world_lidar, scan_times[indices])
         return PosedScans(indices, start_at_identity(poses))
 
 
 def find_ground_truth(recording: Path, name: str | None = None) -> Path | None:
-    """The file with a recording's ground truth; None where there is none.
+    """The file with a recording's ground truth; None if there is none.
 
     Args:
-        recording: a folder, in which it may lie, or a file.
-        name: of the file beside the recording, without its suffix; None for the recording's own.
+        recording: a folder, which may hold the file, or a file.
+        name: of a file beside the recording, without suffix; None for the recording's own name.
     """
     recording = full_path(recording)
     inside = [recording / file for file in _INSIDE]
@@ -97,10 +106,10 @@ def find_ground_truth(recording: Path, name: str | None = None) -> Path | None:
 
 
 def read_ground_truth(path: Path) -> GroundTruth:
-    """Poses in KITTI's format, where a row has twelve numbers, or else in TUM's.
+    """Read poses in KITTI's format if the first row has twelve numbers, else in TUM's.
 
     Raises:
-        DamagedFileError: no such file.
+        DamagedFileError: no such file, or in neither format.
     """
     rows = (row for line in read_lines(path) if (row := line.partition("#")[0].split()))
     if len(next(rows, [])) == 12:
@@ -110,7 +119,7 @@ def read_ground_truth(path: Path) -> GroundTruth:
 
 
 def describe_ground_truth(report: LayoutReport, name: str, path: Path | None) -> None:
-    """Note a recording's ground truth, or that there is none."""
+    """Note the file of a recording's ground truth, or that there is none."""
     if path is None:
         report.odd(name, "no ground truth: errors will not be defined, and the supervised loss cannot be used")
     else:
@@ -120,15 +129,15 @@ def describe_ground_truth(report: LayoutReport, name: str, path: Path | None) ->
 def describe_coverage(
     report: LayoutReport, name: str, truth: GroundTruth, count: int, first_s: float, last_s: float
 ) -> None:
-    """Note where ground truth is not of all scans of a recording.
+    """Note if ground truth does not cover all scans of a recording.
 
     Args:
-        report: what is added to.
+        report: the report to extend.
         name: of the sequence.
         truth: the poses.
-        count: of messages, of which some may be empty.
-        first_s: time of the first.
-        last_s: time of the last.
+        count: number of messages; some may be empty.
+        first_s: time of the first message.
+        last_s: time of the last message.
     """
     if truth.timestamps is None:
         if len(truth.T_world_lidar) != count:
@@ -140,12 +149,3 @@ def describe_coverage(
         report.missing(name, f"{seen}, but scans from {first_s:.3f} to {last_s:.3f} s: use one clock in both files")
     elif first_s < start_s or last_s > end_s:
         report.odd(name, f"{seen}, of scans from {first_s:.3f} to {last_s:.3f} s: those outside are left out")
-
-
-def _no_overlap(times: Float[Tensor, "n"], scan_times: Float[Tensor, "m"]) -> tuple[str, str]:
-    """What is wrong, and what to do."""
-    return (
-        f"its times ({times[0]:.3f} to {times[-1]:.3f} s) do not cover those of the scans "
-        f"({scan_times.min():.3f} to {scan_times.max():.3f} s)",
-        "use one clock in both files",
-    )
