@@ -9,7 +9,7 @@ from lidarlearn.geometry.projection import SphericalProjection
 _TOLERATED_SHARE = 0.1  # the image of a wrong sensor loses a third; the right one a few returns of the outermost beams
 
 
-def view_remark(name: str, points: Float[Tensor, "n 3"], projection: SphericalProjection) -> str | None:
+def field_of_view_warning(name: str, points: Float[Tensor, "n 3"], projection: SphericalProjection) -> str | None:
     """A warning if many points of a scan lie above or below the image; None if they fit.
 
     Args:

@@ -142,9 +142,9 @@ class Folder(DataSetOnDisk):
             report.odd("root", remark)
         return report
 
-    def view_remark(self, name: str, points: Float[Tensor, "n 3"]) -> str | None:
+    def field_of_view_warning(self, name: str, points: Float[Tensor, "n 3"]) -> str | None:
         """As of any data set; of .bin files it may also be that their columns are others."""
-        remark = super().view_remark(name, points)
+        remark = super().field_of_view_warning(name, points)
         if remark is None or _kinds(list_scans(self._folder(name), SUFFIXES)) != [".bin"]:
             return remark
         return f"{remark},\n  or data.bin_columns where these files do not have {self.bin_columns} numbers to a point"

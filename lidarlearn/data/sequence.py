@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidarlearn.data.contract import require_points, require_poses, require_timestamps
 from lidarlearn.data.errors import one_line, require_count
-from lidarlearn.data.field_of_view import view_remark
+from lidarlearn.data.field_of_view import field_of_view_warning
 from lidarlearn.data.scan_files import sequence_names
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
@@ -219,9 +219,9 @@ class DataSet(ABC):
         first = {name: sequence.first_returns() for name, sequence in opened.items()}
         for name, sequence in opened.items():
             sequence.require_contract(first[name])
-        remarks = (self.view_remark(name, scan.points) for name, scan in first.items())
-        if remark := next(filter(None, remarks), None):
-            _log.warning(remark)
+        warnings = (self.field_of_view_warning(name, scan.points) for name, scan in first.items())
+        if warning := next(filter(None, warnings), None):
+            _log.warning(warning)
         return opened
 
     @abstractmethod
@@ -249,19 +249,19 @@ class DataSet(ABC):
         for name in self.names:
             try:
                 sequence = self.open_for_check(name)
-                scan = next(iter(sequence), None) or sequence.first_returns()  # which raises the error
+                scan = next(iter(sequence), None) or sequence.first_returns()  # which raises if there is no scan
                 sequence.require_contract(scan)
                 points = scan.points
-                remark = self.view_remark(name, points) if len(points) else "its first scan has no return"
+                odd = self.field_of_view_warning(name, points) if len(points) else "its first scan has no return"
             except UserError as problem:
                 report.missing(name, one_line(problem))
             else:
-                if remark is not None:
-                    report.odd(name, one_line(remark))
+                if odd is not None:
+                    report.odd(name, one_line(odd))
 
-    def view_remark(self, name: str, points: Float[Tensor, "n 3"]) -> str | None:
+    def field_of_view_warning(self, name: str, points: Float[Tensor, "n 3"]) -> str | None:
         """A warning if many points of a sequence's first scan lie outside the image; None if they do not."""
-        return view_remark(name, points, self.projection)
+        return field_of_view_warning(name, points, self.projection)
 
     def open_for_check(self, name: str) -> Sequence:
         """Open a sequence for a check; subclasses may skip what takes long."""

@@ -28,7 +28,7 @@ def writable(folder: Path, remedy: str) -> Path:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=folder):  # permissions do not tell: a mount may be read-only
+        with TemporaryFile(dir=folder):  # permissions are not enough: a mount may be read-only
             return folder
     except OSError as error:
         raise UserError(f"{folder.absolute()} cannot be written to: {error.strerror}.\n  change: {remedy}") from error

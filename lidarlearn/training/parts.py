@@ -94,11 +94,11 @@ def require_plain(value: object, key: str = "") -> None:
     Raises:
         UntrustedTargetError: it is anything else.
     """
-    if isinstance(value, Mapping):
-        if "_target_" in value:
-            if key not in _NESTED_PARTS:
-                raise UntrustedTargetError(f"{key}._target_", "nothing can be built in this place")
-            return require_trusted(value, _NESTED_PARTS[key])
+    if isinstance(value, Mapping) and "_target_" in value:
+        if key not in _NESTED_PARTS:
+            raise UntrustedTargetError(f"{key}._target_", "nothing can be built in this place")
+        require_trusted(value, _NESTED_PARTS[key])
+    elif isinstance(value, Mapping):
         for name, inner in value.items():
             if not isinstance(name, str | int) or str(name).startswith("_") or name == "defaults":
                 raise UntrustedTargetError(f"the key {name!r}", "Hydra would act on it")
@@ -108,7 +108,6 @@ def require_plain(value: object, key: str = "") -> None:
             require_plain(inner, key)
     elif not isinstance(value, str | int | float | None) or (isinstance(value, str) and "${" in value):
         raise UntrustedTargetError(f"{key}={value!r}", "it is not a plain value")
-    return None
 
 
 def _trusted(name: object, kind: type) -> Any:

@@ -125,7 +125,7 @@ def _errors(metrics: dict[str, Tensor]) -> list[str]:
     shown = {
         "val/avg_translation_error_percent": "avg translation error {:.2f} %",
         "val/mean_relative_translation_error_m": "relative translation error {:.3f} m",
-        "val/mean_relative_translation_error_percent": "= {:.1f} % of motion",  # none where nothing moves
+        "val/mean_relative_translation_error_percent": "= {:.1f} % of motion",  # missing if nothing moves
         "val/misfit": "misfit {:.3f}",
     }
     return [form.format(float(metrics[name])) for name, form in shown.items() if name in metrics]

@@ -7,7 +7,7 @@ from hydra.utils import instantiate
 
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.data import compose_data_set
-from lidarlearn.data.field_of_view import view_remark
+from lidarlearn.data.field_of_view import field_of_view_warning
 from lidarlearn.data.folder import Folder
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation import sensors
@@ -31,13 +31,13 @@ def image(name):
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_sensor_fits_its_own_image(name):
     points = torch.from_numpy(SENSORS[name].directions(0).reshape(-1, 3) * 20)
-    assert view_remark("drive", points, image(name)) is None
+    assert field_of_view_warning("drive", points, image(name)) is None
 
 
 def test_a_wrong_image_is_told_with_what_would_be_right():
     points = torch.from_numpy(sensors.os1_64(64).directions(0).reshape(-1, 3) * 20)
     points = torch.cat([points, torch.zeros(9000, 3)])  # those that did not return do not count
-    remark = view_remark("drive", points, image("hdl64"))
+    remark = field_of_view_warning("drive", points, image("hdl64"))
     assert remark is not None
     assert "44 % of the points of drive's first scan" in remark and "+3 to -24 deg" in remark
     assert "from +21 to -21 deg" in remark and all(name in remark for name in IMAGES)
@@ -66,7 +66,7 @@ def test_opening_sequences_warns_once(caplog):
 def test_genuine_scans_fit_the_images_of_their_sensors(real_data, data, root, sequence):
     data_set = compose_data_set([*data, f"data.root={real_data / root}"])
     points = data_set.sequence(sequence).scan(0).points
-    assert view_remark(sequence, points, data_set.projection) is None
+    assert field_of_view_warning(sequence, points, data_set.projection) is None
 
 
 @pytest.mark.realdata
