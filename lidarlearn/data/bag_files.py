@@ -1,7 +1,7 @@
-"""ROS bags, read with the library `rosbags`: their topics, and the PointCloud2 messages of one of them.
+"""ROS bags, read with the library `rosbags`: their topics, and the PointCloud2 messages of a topic.
 
-A bag is a file (.bag of ROS 1, a lone .db3 or .mcap of ROS 2), a folder with the metadata.yaml of ROS 2, or a folder of
-such files: the parts into which a recorder has split one recording.
+A bag is a file (.bag of ROS 1, a single .db3 or .mcap of ROS 2), a folder with the metadata.yaml of ROS 2, or a folder
+of such files: the parts into which a recorder split one recording.
 """
 
 import os
@@ -22,12 +22,12 @@ from lidarlearn.errors import UserError
 SUFFIXES = (".bag", ".db3", ".mcap")
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 _METADATA, _COMPRESSED = "metadata.yaml", ".zstd"
-_LONGEST_PAUSE_S, _LONGEST_OVERLAP_S = 10.0, 1.0  # from part to part of one recording
+_LONGEST_PAUSE_S, _LONGEST_OVERLAP_S = 10.0, 1.0  # between parts of one recording
 _REPAIR = (
     "copy or download it again, or repair what a recorder left unfinished: `rosbag reindex BAG`,"
     " `ros2 bag reindex FOLDER`, `mcap recover FILE`"
 )
-_NO_DAMAGE = {  # what to change instead, by the library's words
+_NO_DAMAGE = {  # what to change for errors of the library that mean no damage
     "Unrecognized storage format": "the name of the file, to a suffix in small letters",
     "Profile is not ros2": "data.root to the .bag from which it was converted: an .mcap of ROS 1 is not read",
 }
@@ -80,7 +80,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a message is: its part of the bag, the time [ns] at which it was recorded, and its rank at that time."""
+    """Where a message is: its part of the bag, its time of recording [ns], and its rank among messages of that time."""
 
     part: int
     time_ns: int
@@ -88,9 +88,9 @@ class Place:
 
 
 class Bag:
-    """A bag, opened when it is first read: once in every process, since processes cannot share a place in a file.
+    """A bag, opened when it is first read, and once per process: processes cannot share a position in a file.
 
-    All that reads it raises DamagedFileError where it is no bag or a damaged one, and UserError without the library.
+    All methods that read raise DamagedFileError if it is no bag or damaged, and UserError if the library is missing.
 
     Args:
         path: of the file or folder.
@@ -122,7 +122,7 @@ class Bag:
         return 1e-9 * (max(ends) - min(reader.start_time for reader in readers)) if ends else 0.0
 
     def doubt(self) -> str | None:
-        """What speaks against its parts being those of one recording; None where nothing does."""
+        """Why its parts may not belong to one recording; None if they seem to."""
         readers = [reader for reader in self._opened() if reader.message_count]
         pauses = [1e-9 * (b.start_time - a.end_time) for a, b in pairwise(readers)]
         odd = [pause for pause in pauses if not -_LONGEST_OVERLAP_S <= pause <= _LONGEST_PAUSE_S]
@@ -141,7 +141,7 @@ class Bag:
             wanted: its name; None for the only one with point clouds.
 
         Raises:
-            UserError: there is no such topic, or several to choose from.
+            UserError: there is no such topic, or there are several.
         """
         topics = self.topics()
         clouds = [topic for topic in topics if topic.kind == POINT_CLOUD and topic.count]
@@ -163,17 +163,17 @@ class Bag:
             before, rank = None, 0
             connections = _connections(reader, topic)
             with _readable(self.path):
-                for _, time_ns, raw in reader.messages(connections) if connections else ():  # for none it gives all
+                for _, time_ns, raw in reader.messages(connections) if connections else ():  # an empty list means all
                     rank = rank + 1 if time_ns == before else 0
                     before = time_ns
                     yield Place(part, time_ns, rank), _decode(reader, raw)
 
     def ends(self, topic: str) -> tuple[tuple[int, Any], tuple[int, Any]]:
-        """The first and the last PointCloud2 message of a topic that has some, and when each was recorded [ns]."""
+        """The first and the last PointCloud2 message of a topic, each with its time of recording [ns]."""
         place, first = next(self.messages(topic))
         reader = next(r for r in reversed(self._opened()) if _connections(r, topic))
         with _readable(self.path):
-            # from the end: reading through a bag takes minutes
+            # searched from the end: reading a whole bag takes minutes
             starts = (*(reader.end_time - seconds * 10**9 for seconds in (1, 10, 100)), None)
             found = (deque(reader.messages(_connections(reader, topic), start=start), maxlen=1) for start in starts)
             _, last_ns, raw = next(filter(None, found))[0]
@@ -201,7 +201,7 @@ class Bag:
         if _is_file(self.path):
             return [self.path]
         if (self.path / _METADATA).is_file():
-            if holds_scans(self.path, (_COMPRESSED,)):  # every process would unpack it, for itself
+            if holds_scans(self.path, (_COMPRESSED,)):  # every process would unpack it
                 raise UserError(
                     f"{self.path}: its files are compressed as a whole.\n"
                     f"  change: unpack it once, `rosbags-convert --src {self.path} --dst NEW_FOLDER`"
@@ -217,7 +217,7 @@ class Bag:
 
 
 def _is_file(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and os.path.isfile(path)  # false where we may not look
+    return path.suffix.lower() in SUFFIXES and os.path.isfile(path)  # false without permission
 
 
 def _reader(part: Path) -> Any:
@@ -245,7 +245,7 @@ def _decode(reader: Any, raw: bytes) -> Any:
 
 @cache
 def _types(release: str) -> Any:
-    """What messages consist of: PointCloud2 is the same in all releases, and not every bag says so itself."""
+    """The message types of a release: PointCloud2 is the same in all, and not every bag defines it itself."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores(release))
@@ -257,7 +257,7 @@ def _readable(path: Path) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except Exception as error:  # the library's own, its assertions, those of struct, of SQLite and of decompressors
+    except Exception as error:  # of the library, its assertions, struct, SQLite and decompressors
         lines = str(error).splitlines() or [type(error).__name__]
         problem = f"cannot be read as a ROS bag ({lines[0].rstrip('.')})"
         raise DamagedFileError(path, problem, _remedy(path, problem)) from error

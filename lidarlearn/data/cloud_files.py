@@ -1,4 +1,4 @@
-"""Point clouds in the formats that tools exchange: .bin, .npy, .pcd and .ply, with the fields that matter here."""
+"""Point clouds in .bin, .npy, .pcd and .ply files, reduced to points, intensities and times."""
 
 import logging
 from collections.abc import Mapping
@@ -34,10 +34,10 @@ class Cloud:
 
     Args:
         points: float32 [m], finite, without the origin: it stands for "no return".
-        intensities: as they stand; None where there are none.
-        times: as they stand, in the file's unit and from its origin, float64; None where there are none.
-        rows: place of each point among the file's, those that did not return counted.
-        file_rows: how many the file holds.
+        intensities: in the file's unit; None if there are none.
+        times: in the file's unit and from its origin, float64; None if there are none.
+        rows: index of each point in the file, where points without a return count, too.
+        file_rows: number of points in the file.
     """
 
     points: Float[Tensor, "n 3"]
@@ -47,22 +47,22 @@ class Cloud:
     file_rows: int
 
     def select(self, chosen: Bool[Tensor, "n"]) -> "Cloud":
-        """Some of the points."""
+        """The chosen points."""
         intensities = None if self.intensities is None else self.intensities[chosen]
         times = None if self.times is None else self.times[chosen]
         return Cloud(self.points[chosen], intensities, times, self.rows[chosen], self.file_rows)
 
 
 def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
-    """Read a scan in the format that its name says.
+    """Read a scan; the suffix tells the format.
 
     Args:
         path: .bin (float32 rows x, y, z, intensity, ...), .npy (the same as an array, or named fields), .pcd or .ply.
         bin_columns: numbers per point of a .bin file: 4 as in KITTI, 5 as in nuScenes.
 
     Raises:
-        DamagedFileError: not such a file, no point in it, or (.bin, and .npy without names) a point that is not finite.
-            In the others that is a common way to say "no return".
+        DamagedFileError: not such a file, no point in it, or a point that is not finite in a .bin or a .npy without
+            names. In other files such a point stands for "no return".
     """
     match path.suffix.lower():
         case ".bin":
@@ -82,10 +82,10 @@ def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
 
 
 def returns_of(fields: Mapping[str, NDArray[Any]]) -> Cloud:
-    """The returns alone, of all fields those that matter here; drivers send whole grids of points without any, too.
+    """Points, intensities and times of the returns; there may be none, as drivers send grids without any return, too.
 
     Args:
-        fields: a value per point under each of the names that tools use, in lower case.
+        fields: a value per point, by the name of the field in lower case; see the names above.
 
     Raises:
         ValueError: no coordinates, or no points.
@@ -108,14 +108,14 @@ def returns_of(fields: Mapping[str, NDArray[Any]]) -> Cloud:
 def as_scan(
     cloud: Cloud, beam_correction_deg: float, max_intensity: float | None, shares_per_unit: float | None = None
 ) -> Scan:
-    """The scan that a file holds, with point times relative to the middle of the sweep where there are any.
+    """The scan that a file holds, with point times, if there are any, relative to the middle of the sweep.
 
     Args:
-        cloud: as it stands in the file.
+        cloud: as read from the file.
         beam_correction_deg: angle by which every beam is raised.
         max_intensity: the value of full reflectance; None leaves intensities out.
-        shares_per_unit: of the scan period, in a unit of the points' times: points a period away from the others are
-            left out, their times are none. None where that is unknown: a sweep is taken to last for a period.
+        shares_per_unit: scan periods per unit of the points' times. Points a period or more from the median time are
+            left out, since their times are invalid. None if unknown: a sweep is assumed to last for one period.
     """
     if cloud.times is not None and shares_per_unit is not None and len(cloud.points):
         cloud = cloud.select((cloud.times - cloud.times.median()).abs() * shares_per_unit < 1)
@@ -127,13 +127,13 @@ def as_scan(
 
 
 def note_returns(cloud: Cloud, name: str, index: int, empty: list[int]) -> None:
-    """Note a scan without a single return (a covered lens, a dead driver) and warn of a sequence's first one.
+    """Note a scan without any return (a covered lens, a dead driver), and warn of the first one of a sequence.
 
     Args:
-        cloud: as it stands in the file.
+        cloud: as read from the file.
         name: of the sequence.
         index: of the scan.
-        empty: the scans of the sequence that were noted before.
+        empty: indices of the scans noted before; is extended.
     """
     if len(cloud.points):
         return
@@ -143,11 +143,11 @@ def note_returns(cloud: Cloud, name: str, index: int, empty: list[int]) -> None:
 
 
 def relative_times(times: Float[Tensor, "n"], shares_per_unit: float | None = None) -> Float[Tensor, "n"]:
-    """Times as shares of the scan period relative to the middle of the sweep; 0 where all are the same.
+    """Times as shares of the scan period, relative to the middle of the sweep; 0 if all are the same.
 
     Args:
         times: in any unit.
-        shares_per_unit: of the period, in one of them; None where that is unknown: the sweep lasts for the period.
+        shares_per_unit: scan periods per unit; None if unknown: a sweep is assumed to last for one period.
     """
     if not len(times):
         return times.float()
@@ -158,11 +158,11 @@ def relative_times(times: Float[Tensor, "n"], shares_per_unit: float | None = No
 
 
 def require_point_times(sequence: Sequence, where: str) -> None:
-    """Raise UserError where the points of the first scan with a return have no times, or all the same.
+    """Raise UserError if the points of the first scan with a return have no times, or all the same.
 
     Args:
-        sequence: that is to be deskewed.
-        where: its scans are, for the message.
+        sequence: to be deskewed.
+        where: place of the scans, for the message.
     """
     scan = next((scan for scan in sequence if len(scan.points)), None)
     if scan is not None and (scan.times is None or not varied(scan.times)):

@@ -1,12 +1,12 @@
-"""A folder of scans from anywhere: .bin, .npy, .pcd or .ply in natural name order, ground truth where there is some.
+"""A folder of your own scans: .bin, .npy, .pcd or .ply in natural name order, ground truth optional.
 
-On disk: either every subfolder with scans in it is a sequence, or the folder itself is one; where both hold scans, the
-subfolders are, and the folder only by its name. Beside its scans a sequence may have `times.txt` (a time [s] per scan)
-and ground truth of the LiDAR's own poses, in KITTI's or TUM's format: `poses.txt`, `poses.tum`, `groundtruth.txt` with
-the scans, or `<sequence>.txt`, `<sequence>.tum` beside its folder.
-KITTI rows belong to the scans in order; TUM rows are interpolated at the scans' times, where scans before or after them
-are left out, or belong to the scans in order where these have no times. Poses relate to the middle of a sweep. The
-scans' times tell the scan period, too, of which the points' times take a share.
+On disk: every subfolder with scans is a sequence, or else the folder itself is one. If both hold scans, the folder is
+only read if its name is configured. A sequence may have `times.txt` (a time [s] per scan) beside its scans, and ground
+truth of the LiDAR's own poses in KITTI's or TUM's format: `poses.txt`, `poses.tum`, `groundtruth.txt` beside the scans,
+or `<sequence>.txt`, `<sequence>.tum` beside the folder.
+KITTI rows follow the scans' order. TUM rows are interpolated at the scans' times, and scans before or after them are
+left out; without scan times they follow the scans' order, too. Poses relate to the middle of a sweep. The scan period,
+by which the points' times are divided, comes from the scans' times.
 """
 
 import logging
@@ -39,13 +39,13 @@ class FolderSequence(SequenceOnDisk):
     Args:
         name: of the folder.
         scans: its files.
-        T_world_lidar: ground truth; None where there is none.
-        timestamps: from times.txt [s]; None where there is none.
-        shares_per_unit: of the scan period, in a unit of the points' times; None where that is unknown.
+        T_world_lidar: ground truth; None if there is none.
+        timestamps: from times.txt [s]; None if there is none.
+        shares_per_unit: scan periods per unit of the points' times; None if unknown.
         bin_columns: numbers per point of a .bin file.
         max_intensity: the value of full reflectance; None leaves intensities out.
         beam_correction_deg: angle by which every beam is raised.
-        empty: scans that were read and had not a single return.
+        empty: indices of the scans that were read and had no return.
     """
 
     shares_per_unit: float | None
@@ -54,7 +54,7 @@ class FolderSequence(SequenceOnDisk):
     empty: list[int] = field(default_factory=list, init=False)
 
     def scan(self, index: int) -> Scan:
-        """Read one scan, with point times relative to the middle of the sweep where the file has any."""
+        """Read one scan, with point times, if the file has any, relative to the middle of the sweep."""
         cloud = read_cloud(self.scans.path(index), self.bin_columns)
         note_returns(cloud, self.name, index, self.empty)
         return as_scan(cloud, self.beam_correction_deg, self.max_intensity, self.shares_per_unit)
@@ -66,11 +66,11 @@ class Folder(DataSetOnDisk):
     Args:
         root: a folder of scans, or of such folders.
         projection: the image of the sensor.
-        train_sequences: names of subfolders; None takes all there are, or the folder itself.
+        train_sequences: names of subfolders; None takes all, or the folder itself.
         val_sequences: likewise.
         test_sequences: likewise.
         max_frames: keep only the first scans of each sequence; None keeps all.
-        deskew: whether odometries compensate the motion within a scan; only where the files carry point times.
+        deskew: whether odometries compensate the motion within a scan; requires point times in the files.
         beam_correction_deg: angle by which every beam is raised.
         bin_columns: numbers per point of a .bin file: 4 as in KITTI, 5 as in nuScenes.
         max_intensity: the value of full reflectance, e.g. 255; None leaves intensities out.
@@ -101,7 +101,7 @@ class Folder(DataSetOnDisk):
         self.max_intensity = None if max_intensity is None else float(max_intensity)
 
     def sequence(self, name: str) -> FolderSequence:
-        """Open a folder of scans; those that stamped ground truth does not cover are left out."""
+        """Open a folder of scans; those not covered by ground truth with times are left out."""
         folder = self._folder(name)
         files = list_scans(folder, SUFFIXES)
         if not len(files):
@@ -130,7 +130,7 @@ class Folder(DataSetOnDisk):
         return sequence
 
     def sequences(self, names: Iterable[str]) -> dict[str, Sequence]:
-        """Open several sequences; warns of scans that belong to none."""
+        """Open several sequences; warn of scans that belong to none."""
         if remark := self._remark_on_others():
             _log.warning(remark)
         return super().sequences(names)
@@ -143,7 +143,7 @@ class Folder(DataSetOnDisk):
         return report
 
     def field_of_view_warning(self, name: str, points: Float[Tensor, "n 3"]) -> str | None:
-        """As of any data set; of .bin files it may also be that their columns are others."""
+        """As for any data set; .bin files may also have another number of columns."""
         remark = super().field_of_view_warning(name, points)
         if remark is None or _kinds(list_scans(self._folder(name), SUFFIXES)) != [".bin"]:
             return remark
@@ -151,7 +151,7 @@ class Folder(DataSetOnDisk):
 
     @staticmethod
     def is_root(path: Path) -> bool:
-        """Whether it holds scans, or folders of scans."""
+        """Whether a folder holds scans, or folders of scans."""
         return bool(find_sequences(path))
 
     def found(self) -> dict[str, ScanFiles]:
@@ -174,7 +174,7 @@ class Folder(DataSetOnDisk):
         describe_ground_truth(report, name, find_ground_truth(folder))
 
     def _remark_on_others(self) -> str | None:
-        """What to say of scans beside folders of scans, where all of these are configured and they are not."""
+        """A remark on scans beside folders of scans, if all of the folders are configured and the scans are not."""
         own, others = full_path(self.root).name, list_scans(self.root, SUFFIXES)
         if not len(others) or own in self.names or not set(find_sequences(self.root)) <= set(self.names):
             return None
@@ -184,13 +184,13 @@ class Folder(DataSetOnDisk):
         )
 
     def _shares_per_unit(self, files: ScanFiles, timestamps: Float[Tensor, "n"] | None) -> float | None:
-        """Of the scan period, in a unit of the points' times, by the file amid the recording."""
+        """Scan periods per unit of the points' times, from the file in the middle of the recording."""
         if timestamps is None or len(files) < 2 or _kinds(files) not in ([".npy"], [".pcd"], [".ply"]):
             return None
         period_s = float(timestamps.diff().median())
         try:
             times = read_cloud(files.path(len(files) // 2)).times
-        except UserError:  # whoever reads that scan is told
+        except UserError:  # reading that scan raises it again
             return None
         return None if times is None else sweep_clock(times, 0.0, period_s, period_s).shares_per_unit
 
@@ -200,7 +200,7 @@ class Folder(DataSetOnDisk):
 
 
 def find_sequences(root: Path) -> tuple[str, ...]:
-    """Names of the subfolders that hold scans; the folder's own name where it holds them itself; else nothing."""
+    """Names of the subfolders that hold scans; else the folder's own name if it holds scans itself; else nothing."""
     names = tuple(folder.name for folder in subfolders(root) if holds_scans(folder, SUFFIXES))
     return names or ((full_path(root).name,) if holds_scans(root, SUFFIXES) else ())
 

@@ -3,11 +3,11 @@
 On disk: `IJRR-Dataset-{1,2}/SCANS/Scan%04d.mat`, MATLAB files with a structure `SCAN`: `XYZ` (3 x n [m], the laser's
 frame with y forward and x right), `X_wv` (x, y, z [m], roll, pitch, heading [rad]: pose of the vehicle in the world)
 and `timestamp_laser` [us]. We turn points to x forward, y left: x' = y, y' = -x. Returns closer than 8 m are the truck
-itself. The poses sit inside the scans: reading them takes minutes, once, then they are kept beside the scans.
+itself. Poses are inside the scan files: reading them takes minutes the first time, then they are kept beside the scans.
 
 The vehicle's frame is taken to have the axes of the turned points, as in the implementation by the authors of
-Dellenbach et al. 2021. `T_vehicle_lidar_m_deg` is there for whoever finds otherwise in his copy: the data set's
-PARAM.mat and paper place the laser at (2.4, -0.01, -2.3) m, (180, 0, 90) deg in a vehicle frame whose z points down,
+Dellenbach et al. 2021. `T_vehicle_lidar_m_deg` is for copies where this is wrong: the data set's PARAM.mat and paper
+place the laser at (2.4, -0.01, -2.3) m, (180, 0, 90) deg in a vehicle frame whose z points down,
 which for turned points reads [2.4, -0.01, -2.3, 180, 0, 0].
 """
 
@@ -53,14 +53,14 @@ class FordCampusSequence(SequenceOnDisk):
         scans: its files.
         T_world_lidar: ground truth.
         timestamps: of the scans [s].
-        min_range_m: returns closer than this are left out.
+        min_range_m: closer returns are left out.
         beam_correction_deg: angle by which every beam is raised.
     """
 
     min_range_m: float
 
     def scan(self, index: int) -> Scan:
-        """Read one scan; no times, it is motion compensated, and no intensities, the files hold none."""
+        """Read one scan, without times as it is motion compensated, and without intensities as the files hold none."""
         path = self.scans.path(index)
         laser = torch.from_numpy(_field(path, read_scan(path), "XYZ", rows=3).astype(np.float32))
         points = torch.stack([laser[1], -laser[0], laser[2]], dim=1)
@@ -82,9 +82,9 @@ class FordCampus(DataSetOnDisk):
         val_sequences: likewise.
         test_sequences: likewise.
         max_frames: keep only the first scans of each sequence; None keeps all.
-        deskew: must be false, the scans are compensated already.
+        deskew: must be false, as the scans are compensated.
         beam_correction_deg: angle by which every beam is raised.
-        min_range_m: returns closer than this are the truck itself.
+        min_range_m: closer returns are the truck itself.
         T_vehicle_lidar_m_deg: pose of the (turned) laser in the vehicle: x, y, z [m], roll, pitch, yaw [deg].
     """
 
@@ -112,12 +112,12 @@ class FordCampus(DataSetOnDisk):
         self.T_vehicle_lidar = _from_degrees(np.array([list(T_vehicle_lidar_m_deg)], dtype=np.float64))[0]
 
     def sequence(self, name: str) -> FordCampusSequence:
-        """Open a drive; the first time this reads every scan for its pose."""
+        """Open a drive; the first time reads every scan for its pose."""
         scans = self._scans(name).first(self.max_frames)
         return self._open(name, scans, read_poses)
 
     def open_for_check(self, name: str) -> FordCampusSequence:
-        """Open a drive of one scan: reading all for their poses takes minutes."""
+        """Open the first scan of a drive: reading all for their poses takes minutes."""
         return self._open(name, self._scans(name).first(1), lambda _, scans: _read_pose(scans.path(0))[None])
 
     def _open(
@@ -143,7 +143,7 @@ class FordCampus(DataSetOnDisk):
 
     @staticmethod
     def is_root(path: Path) -> bool:
-        """Whether it holds drives with scans."""
+        """Whether a folder holds drives with scans."""
         return any(is_folder(folder / "SCANS") for folder in subfolders(path))
 
     def found(self) -> dict[str, ScanFiles]:
@@ -160,10 +160,10 @@ class FordCampus(DataSetOnDisk):
 
 
 def read_scan(path: Path) -> np.void:
-    """The structure `SCAN` of a file.
+    """Read the structure `SCAN` of a file.
 
     Raises:
-        DamagedFileError: no MATLAB file, truncated, or without it.
+        DamagedFileError: no MATLAB file, truncated, or without the structure.
     """
     try:
         return loadmat(path, variable_names=["SCAN"])["SCAN"][0, 0]
@@ -181,7 +181,7 @@ def read_poses(name: str, scans: ScanFiles) -> NDArray[np.float64]:
     key = scans.fingerprint("poses")
     if (stamped := _kept_poses(kept, key)) is not None:
         return stamped
-    with ThreadPoolExecutor() as pool:  # inflating the files runs beside python
+    with ThreadPoolExecutor() as pool:  # decompression releases the interpreter's lock
         rows = pool.map(_read_pose, (scans.path(i) for i in range(len(scans))))
         stamped = np.stack(list(tracked(rows, f"reading the poses of {name}", len(scans))))
     try:

@@ -1,4 +1,4 @@
-"""Poses between poses, and scans between them."""
+"""Interpolation of ground-truth poses, and which scans they cover."""
 
 import logging
 
@@ -11,18 +11,18 @@ from lidarlearn.geometry import se3
 
 _log = logging.getLogger(__name__)
 
-_LONGEST_GAP_S = 1.0  # between two poses, before scans in between are reported
+_LONGEST_GAP_S = 1.0  # between two poses; scans in longer gaps are reported
 
 
 def interpolate_poses(
     timestamps: Float[Tensor, "n"], T_world: Float[Tensor, "n 4 4"], queries: Float[Tensor, "m"]
 ) -> Float[Tensor, "m 4 4"]:
-    """Poses at other times, with a constant twist between neighbours; beyond the ends the last twist goes on.
+    """Poses at other times, with a constant twist between neighbours, which continues beyond the ends.
 
     Args:
         timestamps: of the poses [s], ascending, at least two.
         T_world: the poses, float64.
-        queries: times asked for [s].
+        queries: times of the wanted poses [s].
     """
     before = (torch.searchsorted(timestamps, queries, right=True) - 1).clamp(0, len(timestamps) - 2)
     share = (queries - timestamps[before]) / (timestamps[before + 1] - timestamps[before])
@@ -33,13 +33,13 @@ def interpolate_poses(
 def covered(
     name: str, timestamps: Float[Tensor, "n"], truth_timestamps: Float[Tensor, "m"], slack_s: float = 0.0
 ) -> list[int]:
-    """Which scans lie within the time of the ground truth; says how many do not, or lie in a hole of it.
+    """Indices of the scans within the time of the ground truth; warns of scans outside of it or in its gaps.
 
     Args:
         name: of the sequence.
         timestamps: of the scans [s].
         truth_timestamps: of the ground-truth poses [s], ascending, at least two.
-        slack_s: by which a scan may be before the first or after the last pose [s].
+        slack_s: how long before the first or after the last pose a scan may be [s].
     """
     inside = (timestamps >= truth_timestamps[0] - slack_s) & (timestamps <= truth_timestamps[-1] + slack_s)
     if not inside.all():

@@ -47,7 +47,7 @@ class KittiOdometrySequence(SequenceOnDisk):
     reference_frame: str = "camera"
 
     def scan(self, index: int) -> Scan:
-        """Read one scan; no times, it is motion compensated."""
+        """Read one scan, which is motion compensated and so has no times."""
         rows = read_float32_rows(self.scans.path(index), columns=4)
         return Scan(raise_beams(rows[:, :3], self.beam_correction_deg), intensities=rows[:, 3].clamp(0, 1))
 
@@ -62,7 +62,7 @@ class KittiOdometry(DataSetOnDisk):
         val_sequences: two digits each.
         test_sequences: two digits each.
         max_frames: keep only the first scans of each sequence; None keeps all.
-        deskew: must be false, the scans are compensated already.
+        deskew: must be false, as the scans are compensated.
         beam_correction_deg: angle by which every beam is raised, 0 for scans as published.
     """
 
@@ -108,7 +108,7 @@ class KittiOdometry(DataSetOnDisk):
 
     @staticmethod
     def is_root(path: Path) -> bool:
-        """Whether it holds `sequences`."""
+        """Whether a folder holds `sequences`."""
         return is_folder(path / "sequences")
 
     def found(self) -> dict[str, ScanFiles]:

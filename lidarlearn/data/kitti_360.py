@@ -44,7 +44,7 @@ class Kitti360Sequence(SequenceOnDisk):
     Args:
         name: four digits.
         scans: its files.
-        T_world_lidar: from GPS, IMU and registration; None where there are no poses.
+        T_world_lidar: from GPS, IMU and registration; None if there are no poses.
         timestamps: when the laser faced forward [s], of the day's clock.
         beam_correction_deg: angle by which every beam is raised.
     """
@@ -121,7 +121,7 @@ class Kitti360(DataSetOnDisk):
 
     @staticmethod
     def is_root(path: Path) -> bool:
-        """Whether it holds `data_3d_raw`."""
+        """Whether a folder holds `data_3d_raw`."""
         return is_folder(path / "data_3d_raw")
 
     def found(self) -> dict[str, ScanFiles]:
@@ -131,7 +131,7 @@ class Kitti360(DataSetOnDisk):
         return {name: self._scans(name) for name in names}
 
     def check_sequence(self, report: LayoutReport, name: str) -> None:
-        """Scans, their times and poses; the calibration shows when the drive is opened."""
+        """Scans, their times and poses; the calibration is checked when the drive is opened."""
         folder = self.root / "data_3d_raw" / drive_folder(name)
         if not is_folder(folder):
             report.missing(name, f"no folder {folder.relative_to(self.root)}")

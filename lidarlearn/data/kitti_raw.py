@@ -4,10 +4,10 @@ On disk: `DATE/DATE_drive_NNNN_sync/{velodyne_points/{data/%010d.bin, timestamps
 oxts/{data/%010d.txt, timestamps.txt}}` and `DATE/calib_imu_to_velo.txt`.
 
 The laser turns clockwise seen from above, from the rear over the left side: a point's time follows from its azimuth.
-A scan's pose is that of the middle of its sweep, when the laser faces forward: the GPS/IMU poses are interpolated
-there (a packet lies 12 to 22 ms off; taking it as it stands doubles the disagreement with registered scans). Scans
-keep their number where the recording dropped some; the dropped ones are blank lines in the time stamps. Scans more than
-0.1 s before the first packet or after the last one are left out: nothing tells where they were.
+A scan's pose is that of the middle of its sweep, when the laser faces forward: GPS/IMU poses are interpolated there (a
+packet is 12 to 22 ms off; without interpolation the disagreement with registered scans doubles). Where the recording
+dropped scans, the others keep their numbers, and the time stamps have blank lines. Scans more than 0.1 s before the
+first packet or after the last one are left out, as their poses are unknown.
 """
 
 import math
@@ -67,7 +67,7 @@ ODOMETRY_DRIVES = {
     "10": Drive("2011_09_30_drive_0034", 0, 1200),
 }
 
-_SLACK_S = 0.1  # by which a scan may be before the first or after the last GPS/IMU packet
+_SLACK_S = 0.1  # a scan may be this long before the first or after the last GPS/IMU packet
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,7 +77,7 @@ class KittiRawSequence(SequenceOnDisk):
     Args:
         name: of the drive, or two digits for the part of it that KITTI odometry holds.
         scans: its files.
-        T_world_lidar: from GPS and IMU; None where they are not there.
+        T_world_lidar: from GPS and IMU; None without their packets.
         timestamps: middle of each sweep [s], of the day's clock.
         beam_correction_deg: angle by which every beam is raised.
     """
@@ -128,11 +128,11 @@ class KittiRaw(DataSetOnDisk):
         return self._open(name, self.max_frames)
 
     def open_for_check(self, name: str) -> KittiRawSequence:
-        """Open a drive of one scan: a long one has thousands of GPS/IMU packets, a file each."""
+        """Open the first scan of a drive: a long drive has thousands of GPS/IMU packets, a file each."""
         return self._open(name, 1)
 
     def _open(self, name: str, count: int | None) -> KittiRawSequence:
-        """Open the first `count` of a drive's scans that its packets cover, all for None."""
+        """Open the first `count` scans of a drive that its packets cover; None opens all."""
         folder = self._folder(name)
         scans = self._scans(name)
         if not len(scans):
@@ -158,11 +158,11 @@ class KittiRaw(DataSetOnDisk):
 
     @staticmethod
     def is_root(path: Path) -> bool:
-        """Whether it holds dates with drives."""
+        """Whether a folder holds dates with drives."""
         return any(_drives(date) for date in subfolders(path))
 
     def found(self) -> dict[str, ScanFiles]:
-        """All drives, those of KITTI odometry under the number by which they are configured."""
+        """All drives; those configured as a sequence of KITTI odometry under its number."""
         configured = {_drive(name).name: name for name in self.names}
         drives = [drive.name.removesuffix("_sync") for date in subfolders(self.root) for drive in _drives(date)]
         names = [configured.get(drive, drive) for drive in drives]
@@ -227,7 +227,7 @@ class KittiRaw(DataSetOnDisk):
         if not calibration.is_file():
             raise self._lacking(name, calibration)
         T_lidar_imu = read_rigid_transform(calibration)
-        # Only what the scans need: a drive has thousands of packets, one file each.
+        # Only the packets that the scans need: a drive has thousands, one file each.
         first = max(int((packet_times <= timestamps.min()).sum()) - 1, 0)
         end = int((packet_times < timestamps.max()).sum()) + 1
         used = range(len(packets))[min(first, len(packets) - 2) : max(first + 2, end)]

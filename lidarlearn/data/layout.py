@@ -1,4 +1,4 @@
-"""What all layout checks have in common: describing files by names and sizes, and finding the right folder level."""
+"""Shared parts of the layout checks: describe files by names and sizes, and find the right folder level."""
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping
@@ -13,9 +13,9 @@ from lidarlearn.errors import UserError
 
 
 def find_root(root: Path, is_root: Callable[[Path], bool]) -> Path | None:
-    """The folder near `root` that looks like the root of a data set: the given one, up to two below, or two above.
+    """The folder that looks like the root of a data set: `root`, or up to two levels below or above it.
 
-    None where there is no such folder, or where `root` itself is not there: its surroundings say nothing then.
+    None if there is no such folder, or if `root` itself does not exist: then its surroundings mean nothing.
     """
     if not is_folder(root):
         return None
@@ -26,17 +26,17 @@ def find_root(root: Path, is_root: Callable[[Path], bool]) -> Path | None:
 
 
 def describe_root(report: LayoutReport, root: Path, is_root: Callable[[Path], bool], marker: str, source: str) -> bool:
-    """Note whether the root is at the right level, and where the right one seems to be.
+    """Note whether the root is at the right folder level, or which folder seems to be.
 
     Args:
-        report: what is added to.
+        report: the report to extend.
         root: as configured.
         is_root: recognises the right level.
-        marker: what the right level holds, for the reader.
+        marker: what the right level holds, for the message.
         source: where the data comes from.
 
     Returns:
-        whether a look below makes sense.
+        Whether the root is at the right level.
     """
     if is_root(root):
         report.found("root", str(root))
@@ -58,14 +58,14 @@ def describe_scans(
     bytes_per_point: int | None,
     smallest_bytes: int = 1,
 ) -> None:
-    """Note how many scans there are, holes in their numbering, and files that cannot be whole.
+    """Note the number of scans, gaps in their numbering, and truncated files.
 
     Args:
-        report: what is added to.
+        report: the report to extend.
         name: of the sequence.
         scans: its files.
-        bytes_per_point: of which every size must be a multiple; None where it is not fixed.
-        smallest_bytes: below which a file cannot hold a scan.
+        bytes_per_point: every size must be a multiple of it; None if it is not fixed.
+        smallest_bytes: size of the smallest file that can hold a scan.
     """
     if not len(scans):
         report.missing(name, f"no scans in {scans.folder}{scans.misnamed}")
@@ -89,15 +89,15 @@ def describe_scans(
 def describe_rows(
     report: LayoutReport, name: str, path: Path, what: str, rows_needed: int, needed: bool = False
 ) -> None:
-    """Note a text file whose rows the numbers of the scans select.
+    """Note a text file with a row for each number of a scan.
 
     Args:
-        report: what is added to.
+        report: the report to extend.
         name: of the sequence.
         path: of the file.
-        what: its rows, in the plural.
+        what: what its rows are, in the plural.
         rows_needed: one more than the greatest number of a scan.
-        needed: whether the data cannot be used without it.
+        needed: whether the data cannot be used without the file.
     """
     if not path.is_file():
         (report.missing if needed else report.odd)(name, f"no {what}: {path} not found")
@@ -112,19 +112,19 @@ def describe_rows(
 
 
 def count_rows(path: Path) -> int:
-    """Number of lines of a text file, blank ones at the end left out: blank ones within stand for dropped frames."""
+    """Number of lines of a text file without blank ones at the end; blank lines within stand for dropped frames."""
     with path.open("rb") as file:
         return max((number for number, line in enumerate(file, start=1) if line.strip()), default=0)
 
 
 def refuse_deskew(title: str, deskew: bool) -> None:
-    """Raise UserError where scans without point times are to be deskewed: that would only make them worse."""
+    """Raise UserError if compensated scans are to be deskewed, which would distort them."""
     if deskew:
         raise UserError(f"{title}: its scans are motion compensated already.\n  change: data.deskew=false")
 
 
 def describe_unconfigured(report: LayoutReport, found: Mapping[str, ScanFiles], configured: Iterable[str]) -> None:
-    """Note the sequences that are there but that no setting names."""
+    """Note the sequences that exist but are not configured."""
     named = set(configured)
     for name, scans in found.items():
         if name not in named:
@@ -132,7 +132,7 @@ def describe_unconfigured(report: LayoutReport, found: Mapping[str, ScanFiles], 
 
 
 def suggest_sequences(report: LayoutReport, found: Iterable[str]) -> None:
-    """Fill in what to change where some of the configured sequences cannot be used."""
+    """Set the report's remedy if some of the configured sequences cannot be used."""
     if report.usable or report.remedy:
         return
     there = examples(found)

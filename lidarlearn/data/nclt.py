@@ -6,7 +6,7 @@ as signed, everything beyond +63.84 m wraps), intensity and laser as 8 bit. Scan
 
 The files' frame is the Segway's: x forward, y right, z down, its origin `sensor_height_m` below the laser, which hangs
 upside down and so sees from -10.67 to +30.67 deg. We move scans into the laser's own centre, x forward, y left, z up,
-as a spherical projection needs: there, and only there, every beam has the constant elevation of the data sheet.
+as a spherical projection needs: only there every beam has the constant elevation of the data sheet.
 Ground truth is the Segway's pose at about 100 Hz: utime, x, y, z, roll, pitch, heading; rows with NaN stand for no fix.
 """
 
@@ -42,7 +42,7 @@ class NcltSequence(SequenceOnDisk):
     Args:
         name: its date.
         scans: its files.
-        T_world_lidar: ground truth at the times of the scans; None where there is none.
+        T_world_lidar: ground truth at the times of the scans; None if there is none.
         timestamps: from the files' names [s].
         beam_correction_deg: angle by which every beam is raised.
         sensor_height_m: of the laser above the origin of the files' frame.
@@ -51,7 +51,7 @@ class NcltSequence(SequenceOnDisk):
     sensor_height_m: float
 
     def scan(self, index: int) -> Scan:
-        """Read one scan; no times, it is motion compensated."""
+        """Read one scan, which is motion compensated and so has no times."""
         data = np.frombuffer(read_bytes(self.scans.path(index), POINT.itemsize), POINT)
         xyz = torch.from_numpy(data["xyz"].astype(np.float32)) * SCALE_M + OFFSET_M
         points = xyz * torch.tensor([1.0, -1.0, -1.0]) - torch.tensor([0.0, 0.0, self.sensor_height_m])
@@ -69,7 +69,7 @@ class Nclt(DataSetOnDisk):
         val_sequences: dates.
         test_sequences: dates.
         max_frames: keep only the first scans of each sequence; None keeps all.
-        deskew: must be false, the scans are compensated already.
+        deskew: must be false, as the scans are compensated.
         beam_correction_deg: angle by which every beam is raised.
         sensor_height_m: of the laser above the origin of the files' frame.
     """
@@ -122,7 +122,7 @@ class Nclt(DataSetOnDisk):
 
     @staticmethod
     def is_root(path: Path) -> bool:
-        """Whether it holds dates with scans."""
+        """Whether a folder holds dates with scans."""
         return any(is_folder(date / "velodyne_sync") for date in subfolders(path))
 
     def found(self) -> dict[str, ScanFiles]:
@@ -158,7 +158,9 @@ class Nclt(DataSetOnDisk):
 
 
 def read_ground_truth(path: Path) -> StampedPoses:
-    """The Segway's poses, z down, from `utime, x, y, z, roll, pitch, heading` [us, m, rad]; rows with NaN are dropped.
+    """Read the Segway's poses, z down; rows with NaN are dropped.
+
+    A row is `utime, x, y, z, roll, pitch, heading` [us, m, rad].
 
     Raises:
         DamagedFileError: not such a file, fewer than two usable rows, or times that do not ascend.

@@ -1,8 +1,8 @@
 """Newer College (2020): walks through an Oxford college with a hand-held Ouster OS1-64, not motion compensated.
 
 On disk: `NAME/raw_format/ouster_scan/cloud_<s>_<ns>.pcd` and `NAME/ground_truth/registered_poses.csv`. A scan's name is
-the time of its first column. A .pcd holds 1024 columns of 64 points each, those without a return at the origin, so a
-point's place in the file gives its time. Poses (`sec,nsec,x,y,z,qx,qy,qz,qw`) are those of the left camera at about
+the time of its first column. A .pcd holds 1024 columns of 64 points each, with the origin for no return, so a point's
+place in the file gives its time. Poses (`sec,nsec,x,y,z,qx,qy,qz,qw`) are those of the left camera at about
 10 Hz, from registration to a survey-grade map; we interpolate them at the middle of each sweep.
 """
 
@@ -47,16 +47,16 @@ class NewerCollegeSequence(SequenceOnDisk):
     Args:
         name: e.g. 01_short_experiment.
         scans: its files.
-        T_world_lidar: ground truth at the middle of each sweep; None where there is none.
+        T_world_lidar: ground truth at the middle of each sweep; None if there is none.
         timestamps: middle of each sweep [s].
         beam_correction_deg: angle by which every beam is raised.
-        empty: scans that were read and had not a single return.
+        empty: indices of the scans that were read and had no return.
     """
 
     empty: list[int] = field(default_factory=list, init=False)
 
     def scan(self, index: int) -> Scan:
-        """Read one scan, with point times relative to the middle of the sweep; none where columns are missing."""
+        """Read one scan, with point times relative to the middle of the sweep; without times if columns are missing."""
         cloud = read_cloud(self.scans.path(index))
         note_returns(cloud, self.name, index, self.empty)
         whole = cloud.file_rows == BEAMS * COLUMNS
@@ -124,7 +124,7 @@ class NewerCollege(DataSetOnDisk):
 
     @staticmethod
     def is_root(path: Path) -> bool:
-        """Whether it holds walks with scans."""
+        """Whether a folder holds walks with scans."""
         return any(is_folder(_scan_folder(folder)) for folder in subfolders(path))
 
     def found(self) -> dict[str, ScanFiles]:
@@ -152,7 +152,7 @@ class NewerCollege(DataSetOnDisk):
 
 
 def read_registered_poses(path: Path) -> StampedPoses:
-    """The left camera's poses from rows of `sec, nsec, x, y, z, qx, qy, qz, qw` [s, ns, m].
+    """Read the left camera's poses from rows of `sec, nsec, x, y, z, qx, qy, qz, qw` [s, ns, m].
 
     Raises:
         DamagedFileError: not such a file, fewer than two rows, or times that do not ascend.

@@ -1,4 +1,4 @@
-"""What data sets that are downloaded or recorded have in common: a root with sequences below it, whole or in part."""
+"""Base of all data sets that are downloaded or recorded: a root with sequences below it, complete or in part."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, fields
@@ -17,13 +17,13 @@ _NO_SETTINGS = ("name", "scans", "T_world_lidar", "timestamps")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SequenceOnDisk(Sequence):
-    """A sequence whose scans are files; a reader adds its settings as fields with a readable `repr`, and `scan`.
+    """A sequence whose scans are files; a reader adds `scan`, and its settings as fields with a readable `repr`.
 
     Args:
         name: as on the command line.
         scans: its files.
-        T_world_lidar: ground truth; None without.
-        timestamps: of the scans [s]; None where unknown.
+        T_world_lidar: ground truth; None if there is none.
+        timestamps: of the scans [s]; None if unknown.
         beam_correction_deg: angle by which every beam is raised.
     """
 
@@ -38,14 +38,14 @@ class SequenceOnDisk(Sequence):
 
     @property
     def fingerprint(self) -> str:
-        """Digest of the reader, its settings and the files; poses and times are no part of a scan."""
+        """Digest of the reader, its settings and the files, without poses and times, which are no part of a scan."""
         given = {f.name: getattr(self, f.name) for f in fields(self) if f.init and f.name not in _NO_SETTINGS}
         settings = {name: value for name, value in given.items() if not isinstance(value, Tensor)}
         return self.scans.fingerprint(type(self).__name__, **settings)
 
 
 class DataSetOnDisk(DataSet):
-    """A data set in the files in which it was published.
+    """A data set in its published files.
 
     Attributes:
         source: where the data comes from.
@@ -59,7 +59,7 @@ class DataSetOnDisk(DataSet):
     @staticmethod
     @abstractmethod
     def is_root(path: Path) -> bool:
-        """Whether a folder is at the level that `root` has to be at."""
+        """Whether a folder is at the level that `root` must have."""
 
     @abstractmethod
     def found(self) -> dict[str, ScanFiles]:
@@ -67,12 +67,12 @@ class DataSetOnDisk(DataSet):
 
     @abstractmethod
     def check_sequence(self, report: LayoutReport, name: str) -> None:
-        """Add what the names and sizes of a configured sequence's files tell."""
+        """Add findings about a configured sequence, from the names and sizes of its files."""
 
     def check(self) -> LayoutReport:
-        """Describe this copy by names and sizes; where these are in order, open each configured sequence.
+        """Describe this copy by names and sizes; if these are in order, open each configured sequence.
 
-        Opening reads times, poses and calibration as far as `open_for_check` goes, and the first scan.
+        Opening reads times, poses, calibration (see `open_for_check`) and the first scan.
         """
         report = LayoutReport()
         if layout.describe_root(report, self.root, self.is_root, self.marker, self.source):
@@ -86,7 +86,7 @@ class DataSetOnDisk(DataSet):
         return report
 
     def not_found(self, name: str, missing: str) -> DataSetNotFoundError:
-        """The error for a sequence of which something is not there, with what there is instead.
+        """The error for a sequence that lacks something, with a hint at what exists instead.
 
         Args:
             name: of the sequence.
@@ -106,5 +106,5 @@ class DataSetOnDisk(DataSet):
         return DataSetNotFoundError(self.title, missing, self.root, self.source, remedy)
 
     def _whole(self) -> dict[str, ScanFiles]:
-        """The sequences with at least one scan."""
+        """The existing sequences with at least one scan."""
         return {name: scans for name, scans in self.found().items() if len(scans)}

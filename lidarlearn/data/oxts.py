@@ -18,7 +18,7 @@ _COLUMNS = 30
 
 
 def read_oxts_poses(packets: ScanFiles) -> Float[Tensor, "n 4 4"]:
-    """T_world_imu of each packet: x east, y north, z up in a Mercator projection scaled at the first packet.
+    """T_world_imu of each packet: x east, y north, z up in a Mercator projection true to scale at the first packet.
 
     Raises:
         DamagedFileError: a packet is empty, incomplete or not finite.
@@ -45,11 +45,11 @@ def mercator(
 
 
 def read_timestamps(path: Path, numbers: list[int]) -> Float[Tensor, "n"]:
-    """Times [s] of some lines of a file of dates with nanoseconds; blank lines stand for dropped frames.
+    """Read times [s] from some lines of a file of dates with nanoseconds; blank lines stand for dropped frames.
 
     Args:
-        path: the file.
-        numbers: which lines, counted from 0.
+        path: of the file.
+        numbers: of the lines, from 0.
 
     Raises:
         DamagedFileError: a line is missing, blank or not a date.

@@ -40,7 +40,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_numbers(path: Path, columns: int, delimiter: str | None = None) -> NDArray[np.float64]:
-    """A text file of rows of numbers, `#` begins a comment; NaN is left to the caller.
+    """Read a text file of rows of numbers; `#` begins a comment, NaN is allowed.
 
     Raises:
         DamagedFileError: absent, empty, not numbers, or another number of columns.
@@ -73,7 +73,7 @@ def require_ascending(path: Path, times: NDArray[np.float64]) -> None:
 
 
 def read_times(path: Path) -> Float[Tensor, "n"]:
-    """Times [s], one a row.
+    """Read times [s], one a row.
 
     Raises:
         DamagedFileError: not such a file, not finite, or times that do not ascend.
@@ -85,7 +85,7 @@ def read_times(path: Path) -> Float[Tensor, "n"]:
 
 
 def read_kitti_poses(path: Path) -> Float[Tensor, "n 4 4"]:
-    """Poses written as the twelve numbers of a 3x4 matrix in row-major order, exactly as they stand.
+    """Read poses written as the twelve numbers of a 3x4 matrix in row-major order, without correcting rotations.
 
     Raises:
         DamagedFileError: not such a file.
@@ -96,7 +96,7 @@ def read_kitti_poses(path: Path) -> Float[Tensor, "n 4 4"]:
 
 
 def read_tum_poses(path: Path) -> StampedPoses:
-    """Poses written as `timestamp tx ty tz qx qy qz qw` [s, m].
+    """Read poses written as `timestamp tx ty tz qx qy qz qw` [s, m].
 
     Raises:
         DamagedFileError: not such a file, a quaternion of length zero, or times that do not ascend.
@@ -196,7 +196,7 @@ def as_transforms(top: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 4 4
 def start_at_identity(T_world: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
     """The same motion with the first pose as the world frame.
 
-    The inverse is a general one: published rotations are orthonormal only to the digits printed.
+    Uses a general matrix inverse, since published rotations are orthonormal only to the digits printed.
     """
     T = torch.linalg.inv(T_world[0]) @ T_world
     T[0] = torch.eye(4, dtype=T.dtype)

@@ -1,11 +1,10 @@
-"""ROS bags: the point clouds (sensor_msgs/PointCloud2) of ROS 1 and ROS 2 recordings, read as they are.
+"""ROS bags: the point clouds (sensor_msgs/PointCloud2) of ROS 1 and ROS 2 recordings, read without conversion.
 
-On disk: every bag in a folder is a sequence, or the root is one bag itself; see `bag_files` for what is a bag. Beside
-it, or in its folder, there may be ground truth of the LiDAR's own poses as with `folder`: `<sequence>.tum` is
-interpolated at the scans' times. A scan's time is the one in its message's header; where its points have times, which
-tell how long after that the middle of the sweep is, it is that of the middle, to which poses relate. A few clouds with
-a time out of order are left out; where most times are, those of recording take their place. Messages without points
-are passed over.
+On disk: every bag in a folder is a sequence, or the root is one bag itself; `bag_files` says what a bag is. Ground
+truth of the LiDAR's own poses may lie beside it or in its folder, as with `folder`: `<sequence>.tum` is interpolated at
+the scans' times. A scan's time is that in its message's header, or, if its points have times, that of the middle of the
+sweep, to which poses relate. If a few clouds have a time out of order, they are left out; if more than a tenth have,
+the times of recording are used. Messages without points are skipped.
 """
 
 import hashlib
@@ -45,14 +44,14 @@ class RosbagSequence(Sequence):
     Args:
         name: of the bag.
         bag: the recording.
-        topic: the clouds' name.
-        places: where in the bag each cloud is.
-        T_world_lidar: ground truth; None where there is none.
-        timestamps: of the middle of each sweep [s]; of its message where points have no times.
-        shares_per_unit: of the scan period, in a unit of the points' times; None where that is unknown.
+        topic: name of the clouds' topic.
+        places: of each cloud in the bag.
+        T_world_lidar: ground truth; None if there is none.
+        timestamps: of the middle of each sweep [s]; of its message if points have no times.
+        shares_per_unit: scan periods per unit of the points' times; None if unknown.
         max_intensity: the value of full reflectance; None leaves intensities out.
         beam_correction_deg: angle by which every beam is raised.
-        empty: scans that were read and had not a single return.
+        empty: indices of the scans that were read and had no return.
     """
 
     name: str
@@ -70,7 +69,7 @@ class RosbagSequence(Sequence):
         return len(self.places)
 
     def scan(self, index: int) -> Scan:
-        """Read one scan, with point times relative to the middle of the sweep where the points have any."""
+        """Read one scan, with point times, if there are any, relative to the middle of the sweep."""
         message = self.bag.message(self.topic, self.places[index])
         try:
             cloud = returns_of(fields_of(message))
@@ -97,13 +96,13 @@ class Rosbag(DataSetOnDisk):
     Args:
         root: a folder of bags, or one bag.
         projection: the image of the sensor.
-        train_sequences: names of bags; None takes all there are.
+        train_sequences: names of bags; None takes all.
         val_sequences: likewise.
         test_sequences: likewise.
         max_frames: keep only the first scans of each sequence; None keeps all.
-        deskew: whether odometries compensate the motion within a scan; only where the points carry times.
+        deskew: whether odometries compensate the motion within a scan; requires point times.
         beam_correction_deg: angle by which every beam is raised.
-        topic: of the point clouds; None takes the only one there is.
+        topic: of the point clouds; None takes the only one.
         max_intensity: the value of full reflectance, e.g. 255; None leaves intensities out.
     """
 
@@ -133,7 +132,7 @@ class Rosbag(DataSetOnDisk):
         self.max_intensity = None if max_intensity is None else float(max_intensity)
 
     def sequence(self, name: str) -> RosbagSequence:
-        """Open a bag and read through its clouds for their times, the first time that it is asked for."""
+        """Open a bag; the first call reads all clouds for their times."""
         if name not in self._sequences:
             bag = self._bag(name)
             if doubt := bag.doubt():
@@ -144,7 +143,7 @@ class Rosbag(DataSetOnDisk):
         return self._sequences[name]
 
     def open_for_check(self, name: str) -> RosbagSequence:
-        """Open a bag as if it had one cloud and no ground truth: reading through all takes minutes."""
+        """Open a bag as if it had one cloud and no ground truth: reading all clouds takes minutes."""
         return self._open(name, self._bag(name), 1, None)
 
     def _open(self, name: str, bag: Bag, max_frames: int | None, truth: GroundTruth | None) -> RosbagSequence:
@@ -169,7 +168,7 @@ class Rosbag(DataSetOnDisk):
 
     @staticmethod
     def is_root(path: Path) -> bool:
-        """Whether it is a bag, or holds bags."""
+        """Whether a path is a bag, or a folder of bags."""
         return bool(find_bags(path))
 
     def found(self) -> dict[str, ScanFiles]:

@@ -1,4 +1,4 @@
-"""Folders of scan files: what they hold, judged by names and sizes alone, and the plain binary ones read."""
+"""Folders of scan files, listed by names and sizes alone, and reading of plain binary files."""
 
 import hashlib
 import itertools
@@ -21,8 +21,8 @@ from lidarlearn.errors import UserError
 
 _log = logging.getLogger(__name__)
 
-_SHOWN = 5  # so many examples are listed before "..."
-_STAMP = r"[1-9]\d{9}"  # begins s, ms, us or ns since 1970; what counts scans with so many digits begins with zeros
+_SHOWN = 5  # examples listed before "..."
+_STAMP = r"[1-9]\d{9}"  # start of s, ms, us or ns since 1970; scan numbers of ten digits start with zeros
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class ScanFiles:
         folder: where they are.
         names: file names, in natural order: 9 before 10, 1583836592.119722 before 1583836592.22498.
         sizes: of each file [bytes].
-        others: files of the same kind beside them whose names are not those of scans.
-        like: a name that a scan might have, for whoever finds none; "" where any will do.
+        others: files of the same kind in the folder that are not named like scans.
+        like: example of a scan's name, for error messages; "" if any name will do.
     """
 
     folder: Path
@@ -48,7 +48,7 @@ class ScanFiles:
 
     @property
     def misnamed(self) -> str:
-        """Where no file is a scan, those that might have been meant: " (3 files, none named like ...)" or ""."""
+        """If no file is named like a scan, what is there instead: " (3 files there, none named like ...)", else ""."""
         if self.names or not self.others:
             return ""
         return f" ({len(self.others)} files there, none named like {self.like}: {examples(map(repr, self.others))})"
@@ -59,12 +59,12 @@ class ScanFiles:
 
     @property
     def numbers(self) -> list[int]:
-        """The last number in each file's name: what data sets count their scans by; -1 where there is none."""
+        """The last number in each file's name, by which data sets count their scans; -1 if there is none."""
         return [int(found[-1]) if (found := re.findall(r"\d+", Path(name).stem)) else -1 for name in self.names]
 
     @property
     def counted(self) -> bool:
-        """Whether the files' names count the scans, rather than giving the time of each."""
+        """Whether names are numbers of scans rather than times."""
         return not any(re.search(_STAMP, name) for name in self.names)
 
     def select(self, indices: Iterable[int]) -> "ScanFiles":
@@ -79,8 +79,8 @@ class ScanFiles:
     def fingerprint(self, reader: str, **settings: Any) -> str:
         """Digest of the reader, its settings and the files, wherever the folder lies.
 
-        Of the files count all names and sizes, and the contents of the first, the middle and the last one: organized
-        clouds are all of one size, whatever they show.
+        It covers the names and sizes of all files, and the contents of the first, the middle and the last one, since
+        organized clouds all have the same size.
 
         Raises:
             DamagedFileError: one of the three cannot be read.
@@ -92,15 +92,15 @@ class ScanFiles:
 
 
 def list_scans(folder: Path, suffixes: tuple[str, ...], stems: str = ".*", like: str = "") -> ScanFiles:
-    """The scan files of a folder, hidden ones left out; none where the folder is absent.
+    """The scan files of a folder without hidden ones; none if the folder is absent.
 
-    Only names and sizes are looked at, which takes a tenth of a second for 20,000 files.
+    Reads only names and sizes, which takes a tenth of a second for 20,000 files.
 
     Args:
         folder: where they are.
         suffixes: of their names.
-        stems: regular expression of what stands before; a copy `000002 (1).bin` is no scan of KITTI's.
-        like: a name with such a stem.
+        stems: regular expression of the names without suffix; a copy `000002 (1).bin` is no scan of KITTI's.
+        like: example of a name.
     """
     found = [(e.name, e.stat().st_size) for e in _entries(folder) if _is_scan(e, suffixes)]
     number = _numbers_in(name for name, _ in found)
@@ -121,9 +121,9 @@ def _is_scan(entry: "os.DirEntry[str]", suffixes: tuple[str, ...]) -> bool:
 
 
 def subfolders(folder: Path) -> list[Path]:
-    """The folders directly below one, in natural order; none where it is absent.
+    """The folders directly below one, in natural order; none if it is absent.
 
-    Hidden ones are left out, and those that we may not look into, such as lost+found.
+    Hidden ones and those without permission to read, such as lost+found, are left out.
     """
     shown = (e.path for e in _entries(folder) if not e.name.startswith("."))
     found = (Path(path) for path in shown if os.path.isdir(path) and os.access(path, os.R_OK | os.X_OK))
@@ -131,20 +131,20 @@ def subfolders(folder: Path) -> list[Path]:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder, as far as we may look: `Path.is_dir` raises PermissionError where we may not.
+    """Whether there is a folder; false without permission to look.
 
-    `os.DirEntry.is_dir` does so, too, and for links that lead in a circle.
+    `Path.is_dir` raises PermissionError then; so does `os.DirEntry.is_dir`, which also raises for circular links.
     """
     return os.path.isdir(path)
 
 
 def full_path(path: Path) -> Path:
-    """Absolute and without `..`: what it ends with is the name of the folder, and its parent the one above."""
+    """The absolute path without `..`, whose `name` is that of the folder and whose `parent` is the one above."""
     return Path(os.path.abspath(path))
 
 
 def _entries(folder: Path) -> list["os.DirEntry[str]"]:
-    """What a folder holds; nothing where it is absent or closed to us."""
+    """The entries of a folder; none if it is absent or cannot be read."""
     if not is_folder(folder) or not os.access(folder, os.R_OK):
         return []
     with os.scandir(folder) as entries:
@@ -162,17 +162,17 @@ def natural_key(name: str, number: str = r"\d+") -> tuple[list[tuple[Decimal, st
 
     Args:
         name: to be sorted.
-        number: regular expression of what counts as one.
+        number: regular expression of a number.
     """
     parts = re.split(f"({number})", name)
     return [(Decimal(part), "") if i % 2 else (Decimal(-1), part) for i, part in enumerate(parts)], name
 
 
 def _numbers_in(names: Iterable[str]) -> str:
-    """Regular expression of the numbers in names: with decimals where these are seconds as Python prints a float.
+    """Regular expression of the numbers in names; with decimals if they are seconds that Python printed as floats.
 
-    It leaves out the last zeros: .22498 follows .119722. Nine digits are nanoseconds, which others print without the
-    first zeros: .119722000 follows .22498. A float of such seconds has seven at most.
+    Floats lack trailing zeros: .22498 comes after .119722. Such a float has at most seven decimals; eight or more are
+    nanoseconds, which some tools print without leading zeros: there .119722000 comes after .22498.
     """
     of_nanoseconds = any(re.search(rf"{_STAMP}\.\d{{8}}", name) for name in names)
     return r"\d+" if of_nanoseconds else rf"{_STAMP}\.\d+|\d+"
@@ -183,10 +183,10 @@ def sequence_names(names: Iterable[str | int] | str | int, digits: int = 0) -> t
 
     Args:
         names: several names, or a single one.
-        digits: to which numbers are filled up.
+        digits: to which numbers are zero-padded.
 
     Raises:
-        UserError: a name is a path: files of a run are called like its sequences, and shall not leave its folder.
+        UserError: a name is a path: runs name files after sequences, and these must stay in the run's folder.
     """
     several = [names] if isinstance(names, (str, int)) else names
     found = tuple(f"{name:0{digits}d}" if isinstance(name, int) else str(name) for name in several)
@@ -197,12 +197,12 @@ def sequence_names(names: Iterable[str | int] | str | int, digits: int = 0) -> t
 
 
 def gaps(numbers: list[int]) -> list[tuple[int, int]]:
-    """First and last number of each hole in an ascending count."""
+    """First and last number of each gap in ascending numbers."""
     return [(a + 1, b - 1) for a, b in itertools.pairwise(numbers) if b > a + 1]
 
 
 def warn_of_gaps(sequence: str, scans: ScanFiles) -> None:
-    """Log where the numbering of a sequence's scans has holes: neighbours there are not one period apart."""
+    """Warn of gaps in the numbering of a sequence's scans, where neighbours are more than a period apart."""
     if holes := gaps(scans.numbers):
         _log.warning(
             "%s: %d gaps in the numbering of the scans in %s, the first from %d to %d",
@@ -211,7 +211,7 @@ def warn_of_gaps(sequence: str, scans: ScanFiles) -> None:
 
 
 def read_float32_rows(path: Path, columns: int) -> Float[Tensor, "n c"]:
-    """A file of nothing but float32 rows: KITTI's x, y, z [m], reflectance in [0, 1].
+    """Read a file of float32 rows, such as KITTI's x, y, z [m], reflectance in [0, 1].
 
     Raises:
         DamagedFileError: absent, empty, truncated, or not finite.
@@ -225,10 +225,10 @@ def read_float32_rows(path: Path, columns: int) -> Float[Tensor, "n c"]:
 
 
 def read_bytes(path: Path, bytes_per_point: int = 1) -> bytearray:
-    """The content of a file of points, writable so that tensors can share it.
+    """Read a file of points; the content is writable, so that tensors can share its memory.
 
     Raises:
-        DamagedFileError: absent, empty, or the size is no multiple of a point's.
+        DamagedFileError: absent, empty, or its size is not a multiple of a point's.
     """
     try:
         data = bytearray(path.read_bytes())
