@@ -1,4 +1,4 @@
-"""Progress of tasks that process scan by scan: simulating, projecting, running an odometry, writing."""
+"""Progress of tasks that process scans one by one: simulating, projecting, running an odometry, writing."""
 
 import sys
 import time
@@ -16,14 +16,17 @@ _SECONDS_BETWEEN_LINES = 30.0
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show the progress of a task; call the function that it yields after each scan, from any thread.
+    """Show the progress of a task.
 
     A terminal shows a bar, which disappears at the end. A file or a pipe gets a line at the start and then one every
-    half minute, so that a log stays readable and a silent task is not taken for a finished one.
+    half minute, so that logs stay readable and a running task does not look finished.
 
     Args:
         what: name of the task, e.g. "projecting sequence 00".
         total: number of scans.
+
+    Yields:
+        A function to call after each scan, from any thread.
     """
     if sys.stdout.isatty():
         description = TextColumn("{task.description}", markup=False)
@@ -47,7 +50,7 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 def tracked(items: Iterable[T], what: str, total: int) -> Iterator[T]:
-    """The items, with their progress shown."""
+    """Iterate over the items and show the progress."""
     with progress(what, total) as advance:
         for item in items:
             yield item

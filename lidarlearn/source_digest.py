@@ -1,4 +1,4 @@
-"""What made a file that is kept: a hash of the code, instead of a version that someone has to remember to raise."""
+"""Hashes of source code, which tell whether other code made a stored file. Unlike versions, they need no upkeep."""
 
 import ast
 import hashlib
@@ -21,17 +21,16 @@ Origin = Path | type | Callable[..., Any]
 
 @cache
 def source_digest(*origins: Origin, within: Path = PACKAGE) -> str:
-    """Hash of source files and of all modules that they import, directly or not.
+    """Hash of source files and of all modules that they import, directly or indirectly.
 
-    The same code gives the same results, committed or not; other code may not. What counts is the syntax: comments,
-    docstrings and line breaks do not. What libraries import is not looked at, nor what is imported by a name that is
-    put together while running.
+    Only the syntax counts: comments, docstrings and line breaks do not change the hash. Imports of installed libraries
+    are not followed, nor imports of a name that is only known at run time.
 
     Args:
-        origins: where to begin: files, or classes and functions, of the package or anybody's. These stand for their
-            files and those of their bases; in a notebook, for the cell that defines them. The digest of one whose
-            source is nowhere to be seen is another in every process.
-        within: of the package's files, imports are followed only to those below this folder.
+        origins: files, classes or functions, of this package or of any other code. Classes and functions stand for
+            their files and those of their base classes; in a notebook, for the cells that define them. If the source
+            cannot be found, the hash differs in every process.
+        within: imports of files of this package are followed only below this folder.
     """
     digest = hashlib.sha256()
     for path, tree in sorted(_with_imports(origins, within).items(), key=lambda file: file[0]):
@@ -52,13 +51,13 @@ def _with_imports(origins: Iterable[Origin], within: Path) -> dict[Path, ast.Mod
 
 
 def _sources(origin: Origin) -> Iterator[tuple[Path, bytes | None]]:
-    """The files behind an origin; where there is none, what it consists of under a name in its stead."""
+    """The files of an origin, each with None; without a file, a name and the source that stands for it."""
     if isinstance(origin, Path):
         yield origin.resolve(), None
         return
     owner = origin.__self__ if inspect.ismethod(origin) else origin
     for part in inspect.getmro(owner) if inspect.isclass(owner) else (owner,):
-        if not inspect.isclass(part) and not inspect.isroutine(part):  # an object, made of who knows what
+        if not inspect.isclass(part) and not inspect.isroutine(part):  # an object, whose state is unknown
             yield Path(type(part).__name__).resolve(), _never_seen_before()
         elif (part.__module__ or "").partition(".")[0] not in sys.stdlib_module_names:
             file = getattr(sys.modules.get(part.__module__), "__file__", None)
@@ -66,11 +65,11 @@ def _sources(origin: Origin) -> Iterator[tuple[Path, bytes | None]]:
 
 
 def _cell(part: type | Callable[..., Any]) -> bytes:
-    """The cell of a notebook that defines a class, which only its methods can tell, or a function."""
+    """The source of the notebook cell that defines a function or a class; a class is found by its methods."""
     for function in filter(inspect.isfunction, [part, *getattr(part, "__dict__", {}).values()]):
         try:
             return "".join(inspect.findsource(function)[0]).encode()
-        except OSError:  # of a dataclass's methods, for example
+        except OSError:  # no source, such as for the methods of a dataclass
             continue
     return _never_seen_before()
 
@@ -82,7 +81,7 @@ def _never_seen_before() -> bytes:
 def _parsed(source: bytes) -> ast.Module:
     try:
         return ast.parse(source)
-    except (SyntaxError, ValueError):  # an extension module, or a notebook's own syntax: every byte counts
+    except (SyntaxError, ValueError):  # an extension module, or notebook magic: hash the bytes
         return ast.Module([ast.Expr(ast.Constant(source))], [])
 
 
@@ -93,11 +92,11 @@ def _followed(file: Path, within: Path) -> bool:
 
 
 def _imports(path: Path, tree: ast.Module) -> Iterator[Path]:
-    """The files of the modules that a file imports, wherever in it."""
+    """The files of the modules that a file imports, at any place in it."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             folders, names = _import_folders(path), [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):  # of a name nobody can tell whether it is a module but the disk
+        elif isinstance(node, ast.ImportFrom):  # only the disk tells whether an imported name is a module
             folders = [path.parents[node.level - 1]] if node.level else _import_folders(path)
             start = [node.module] if node.module else []
             names = [".".join(start), *(".".join([*start, alias.name]) for alias in node.names)]
@@ -110,7 +109,7 @@ def _imports(path: Path, tree: ast.Module) -> Iterator[Path]:
 
 
 def _import_folders(path: Path) -> list[Path]:
-    """Where absolute imports of a file are looked for, in this order."""
+    """The folders to search for absolute imports of a file, in this order."""
     if path.is_relative_to(PACKAGE):
         return [PACKAGE.parent]
     beside = next(folder for folder in path.parents if not (folder / "__init__.py").is_file())
@@ -118,7 +117,7 @@ def _import_folders(path: Path) -> list[Path]:
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:
-    """The tree, in place."""
+    """Remove all docstrings from the tree, in place."""
     for node in ast.walk(tree):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
             if ast.get_docstring(node, clean=False) is not None:

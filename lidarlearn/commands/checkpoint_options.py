@@ -97,7 +97,7 @@ def add_to_search_path(arguments: list[str], folder: Path, *options: str) -> Non
 
     Args:
         arguments: the command line, completed in place: after the overrides, before flags that may follow.
-        folder: the folder, which only this machine can read.
+        folder: the folder, which only this machine can read; for the message.
         options: further overrides to add.
 
     Raises:

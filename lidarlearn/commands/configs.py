@@ -1,4 +1,4 @@
-"""The place of the configuration."""
+"""The location of the configuration files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A Hydra application that prints errors of the user as one message instead of a stack trace."""
+"""Run a Hydra application that prints errors that the user can fix as one message instead of a stack trace."""
 
 import os
 import sys
@@ -18,7 +18,7 @@ from lidarlearn.errors import UserError
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 
-# Causes of a failed instantiation that a setting can mend, as a UserError; any other is a defect with a stack trace.
+# Causes of a failed instantiation that a setting can fix, besides a UserError; any other is a bug.
 _SETTINGS_AT_FAULT = (TypeError, ValueError, ImportError)
 
 
@@ -80,7 +80,7 @@ def readable_errors(config_name: str, arguments: Sequence[str] | None = None) ->
 
 
 def readable_message(error: Exception, config_name: str, arguments: Sequence[str] | None = None) -> str | None:
-    """The message of an error that the user can fix; None if the error is a defect.
+    """The message of an error that the user can fix; None if the error is a bug.
 
     Args:
         error: any exception.
@@ -104,7 +104,7 @@ def readable_message(error: Exception, config_name: str, arguments: Sequence[str
 
 
 def _is_misconfiguration(error: BaseException | None) -> bool:
-    """Whether it is Lightning's error; compared by name, because an evaluation need not wait for Lightning's import."""
+    """Whether it is Lightning's error. Compares names, so that evaluations need not wait for Lightning's import."""
     return any(base.__name__ == "MisconfigurationException" for base in type(error).__mro__)
 
 

@@ -39,7 +39,7 @@ _WITHOUT_NETWORK = ("cv+p_f2m", "cv+kd_f2m", "cv+vh_f2m")
 def main() -> None:
     """Entry point of `evaluate.py` and `lidarlearn-evaluate`."""
     with tempfile.TemporaryDirectory() as folder:
-        entry_point.run(_evaluate_as_chosen, "evaluate", lambda: add_data(sys.argv, Path(folder)))
+        entry_point.run(_evaluate_locked, "evaluate", lambda: add_data(sys.argv, Path(folder)))
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,9 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     poses: dict[str, dict[str, Tensor]] = {}
     scores: list[Score] = []
     if config.trajectories:
-        results = _foreign(config, sequences)
+        results = _score_trajectories(config, sequences)
     else:
-        results = _own(config, methods, networks, sequences, run_folder)
+        results = _run_methods(config, methods, networks, sequences, run_folder)
     try:
         for row, T_world_lidar in results:
             scores.append(row)
@@ -104,7 +104,7 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     return Evaluation(sequences, poses, scores)
 
 
-def _own(
+def _run_methods(
     config: DictConfig,
     methods: list[Method],
     networks: Mapping[str, Mapping[str, Any]],
@@ -114,12 +114,12 @@ def _own(
     """Run every method on every sequence and score the exported trajectories; finished ones are reused."""
     data = OmegaConf.to_container(config.data, resolve=True)
     for method in methods:
-        own = method_settings(config, method, networks)
-        own["code"] = code_digest(own, data)
+        of_method = method_settings(config, method, networks)
+        of_method["code"] = code_digest(of_method, data)
         for sequence in sequences.values():
             what = f"{method} on {sequence.name}"
             export = Export(run_folder / "trajectories" / str(method), sequence.name)
-            settings = {"scans": sequence.fingerprint, **own}
+            settings = {"scans": sequence.fingerprint, **of_method}
             found = export.settings()
             if found != settings:
                 if found is not None:
@@ -137,7 +137,7 @@ def _own(
             yield score(str(method), T_world_lidar, sequence, speed, health), T_world_lidar
 
 
-def _foreign(config: DictConfig, sequences: Mapping[str, Sequence]) -> Iterator[tuple[Score, Tensor]]:
+def _score_trajectories(config: DictConfig, sequences: Mapping[str, Sequence]) -> Iterator[tuple[Score, Tensor]]:
     """Score the trajectories of other tools."""
     found = find_trajectories(Path(config.trajectories), list(sequences))
     for method, files in found.items():
@@ -171,7 +171,7 @@ def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
     return instantiate(config.pipeline)(initialization, instantiate(config.odometry[method.backend]))
 
 
-def _evaluate_as_chosen(config: DictConfig) -> None:
+def _evaluate_locked(config: DictConfig) -> None:
     _require_use_of_checkpoint(config)
     with held_run_folder(Path(config.run_dir)):
         evaluate(config, chosen_data(config))

@@ -94,15 +94,15 @@ def _compare(arguments: list[str]) -> None:
 
 
 def _map(arguments: list[str]) -> None:
-    usual = MapSettings()
+    default = MapSettings()
     parser = argparse.ArgumentParser("python -m lidarlearn.evaluation map")
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of an evaluation")
     parser.add_argument("--method", metavar="NAME", help="only this method, e.g. cv+kd_f2m; default: all")
     parser.add_argument("--sequence", metavar="NAME", help="only this sequence; default: all")
-    parser.add_argument("--voxel", type=float, default=usual.voxel_size_m, metavar="M", help="voxel edge [m]")
-    parser.add_argument("--every", type=int, default=usual.every, metavar="N", help="only each n-th scan")
-    parser.add_argument("--min-range", type=float, default=usual.min_range_m, metavar="M", help="of used points [m]")
-    parser.add_argument("--max-range", type=float, default=usual.max_range_m, metavar="M", help="of used points [m]")
+    parser.add_argument("--voxel", type=float, default=default.voxel_size_m, metavar="M", help="edge of a voxel [m]")
+    parser.add_argument("--every", type=int, default=default.every, metavar="N", help="only every n-th scan")
+    parser.add_argument("--min-range", type=float, default=default.min_range_m, metavar="M", help="least range [m]")
+    parser.add_argument("--max-range", type=float, default=default.max_range_m, metavar="M", help="greatest range [m]")
     parser.add_argument("overrides", nargs="*", metavar="data.KEY=VALUE", help="if the data has moved: data.root=DIR")
     options = parser.parse_intermixed_args(arguments)
 

@@ -43,11 +43,11 @@ def make_maps(
     names = sorted({export.sequence for export in exports})
     data.prepare(names)
     sequences = data.sequences(names)
-    _kept(run / "maps" / "maps.json")  # reports a damaged file before the work
+    _entries(run / "maps" / "maps.json")  # reports a damaged file before the work
     rows = []
     for export in exports:
         rows.append(_make_map(run, export, sequences[export.sequence], settings, config.data.deskew))
-        _keep(run / "maps" / "maps.json", rows[-1])
+        _add_entry(run / "maps" / "maps.json", rows[-1])
     print_tables([_table(rows)])
     print(f"maps: {run / 'maps'}")
 
@@ -121,15 +121,15 @@ def _make_map(run: Path, export: Export, sequence: Sequence, settings: MapSettin
     }
 
 
-def _keep(path: Path, row: dict[str, Any]) -> None:
+def _add_entry(path: Path, row: dict[str, Any]) -> None:
     """Add the entry of a map to `maps.json`, replacing an earlier one of the same method and sequence."""
-    others = [old for old in _kept(path) if (old["method"], old["sequence"]) != (row["method"], row["sequence"])]
+    others = [old for old in _entries(path) if (old["method"], old["sequence"]) != (row["method"], row["sequence"])]
     with atomic_write(path) as draft:
         draft.write_text(json.dumps({"maps": [*others, row]}, indent=2) + "\n", encoding="utf-8")
 
 
-def _kept(path: Path) -> list[dict[str, Any]]:
-    """The entries of earlier maps."""
+def _entries(path: Path) -> list[dict[str, Any]]:
+    """The entries of earlier maps; empty if there is no file."""
     if not path.is_file():
         return []
     try:

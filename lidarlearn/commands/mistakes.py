@@ -16,7 +16,7 @@ from lidarlearn.commands.configs import config_directory
 from lidarlearn.errors import UserError
 
 _OTHER_PROGRAM = {"train": "evaluate.py", "evaluate": "train.py"}
-_LEAST_LIKENESS = 0.6  # of a name that is suggested
+_LEAST_LIKENESS = 0.6  # least similarity of a suggested name
 
 _NO_OPTION = "Config group override must be"  # a ValueError, unlike Hydra's other errors
 
@@ -47,7 +47,7 @@ def explanation(error: Exception, program: str, arguments: Sequence[str]) -> str
     if key is not None:
         name = key[1] or key[2]
         return f"there is no setting or group '{name}'{_question(nearest(name, _keys(program, name, arguments)))}"
-    # the rest without its hints for programmers
+    # any other message, without its hints for programmers
     lines = [line.strip() for line in text.splitlines()]
     return "  ".join(line for line in lines if line and not line.startswith(("See https", "object_type=", "^")))
 
@@ -88,14 +88,14 @@ def _unknown_option(path: str, options: Sequence[str]) -> str:
     group, _, option = path.partition("/")
     folder = config_directory() / group
     ours = (path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
-    known = sorted({*ours, *options})  # those of the user are among Hydra's
+    known = sorted({*ours, *options})  # Hydra's options include those of the user
     beside = [other for other in known if PurePosixPath(other).parent == PurePosixPath(option).parent]
     similar = [f"{group}={other}" for other in nearest(option, known)]
     return "\n    ".join([f"there is no {group}={option}{_question(similar)}\n  options:", *(beside or options)])
 
 
 def _no_option(arguments: Sequence[str]) -> str | None:
-    """Message about a group whose value is no name of an option, such as null; None if the group is not ours."""
+    """Message about a group whose value cannot be the name of an option, such as null; None if there is none."""
     for argument in arguments:
         if "=" in argument and not argument.startswith("-"):
             override = OverridesParser.create().parse_override(argument)

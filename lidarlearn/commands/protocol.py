@@ -16,7 +16,7 @@ from lidarlearn.errors import UserError
 from lidarlearn.evaluation.methods import Method
 from lidarlearn.training.checkpoints import load_checkpoint, sha256
 
-_STEPS_PER_M = 2**13  # 0.1 mm; a power of two, because decimals in files would often be halfway between two steps
+_STEPS_PER_M = 2**13  # about 0.1 mm; a power of two, because decimals in files are rarely halfway between two steps
 
 
 def describe_networks(config: DictConfig, methods: Iterable[Method]) -> dict[str, dict[str, Any]]:
@@ -68,7 +68,7 @@ def evaluation_protocol(
     """Everything that must agree for two results to be comparable, and the versions and settings behind them."""
     data = config.data
     frame = ", ".join(dict.fromkeys(sequence.reference_frame for sequence in sequences.values()))
-    foreign = {"path": config.trajectories, "frame": config.trajectories_frame or frame}
+    trajectories = {"path": config.trajectories, "frame": config.trajectories_frame or frame}
     return {
         "data": data_name,
         "sequences": list(sequences),
@@ -78,7 +78,7 @@ def evaluation_protocol(
         "beam_correction_deg": data.beam_correction_deg,
         "deskew": data.deskew,
         "trajectory_frame": frame,
-        "trajectories": None if config.trajectories is None else foreign,
+        "trajectories": None if config.trajectories is None else trajectories,
         "checkpoint": networks.get("posenet"),
         "networks": {name: network for name, network in networks.items() if name != "posenet"},
         "lidarlearn": lidarlearn.__version__,
@@ -92,7 +92,7 @@ def evaluation_protocol(
 def ground_truth_digest(sequence: Sequence) -> str | None:
     """Hash of the ground truth of a sequence; None if there is none.
 
-    It ignores the last digits, in which machines differ that compute the poses from the same files.
+    It ignores the last digits, in which poses computed from the same files differ between machines.
     """
     if sequence.T_world_lidar is None:
         return None

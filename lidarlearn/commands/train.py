@@ -34,7 +34,7 @@ _PLAIN_CHARACTERS = frozenset(string.ascii_letters + string.digits + "/._-:+")
 def main() -> None:
     """Entry point of `train.py` and `lidarlearn-train`."""
     with tempfile.TemporaryDirectory() as folder:
-        entry_point.run(_train_and_say_what_next, "train", lambda: add_settings(sys.argv, Path(folder)))
+        entry_point.run(_train_and_print_next_step, "train", lambda: add_settings(sys.argv, Path(folder)))
 
 
 def train(config: DictConfig, data_name: str) -> Path:
@@ -96,17 +96,17 @@ def command_with(
     return f"{start} {shlex.join(arguments)}"
 
 
-def _train_and_say_what_next(config: DictConfig) -> None:
+def _train_and_print_next_step(config: DictConfig) -> None:
     try:
         checkpoint = train(config, chosen_data(config))
-    except SystemExit:  # Lightning's way to end at SIGINT and at SIGTERM, at the latter with 0 as if all were done
-        _say_how_to_go_on(config)
+    except SystemExit:  # raised by Lightning on SIGINT and SIGTERM, on the latter with 0 as if the training were done
+        _print_how_to_resume(config)
         sys.exit(1)
-    _say_what_next(checkpoint.resolve(), config)
+    _print_next_step(checkpoint.resolve(), config)
 
 
 @rank_zero_only
-def _say_what_next(checkpoint: Path, config: DictConfig) -> None:
+def _print_next_step(checkpoint: Path, config: DictConfig) -> None:
     if checkpoint.exists():
         print(f"\ncheckpoint: {checkpoint}")
         if any(Path(config.run_dir).rglob("events.out.tfevents*")):
@@ -115,7 +115,7 @@ def _say_what_next(checkpoint: Path, config: DictConfig) -> None:
 
 
 @rank_zero_only
-def _say_how_to_go_on(config: DictConfig) -> None:
+def _print_how_to_resume(config: DictConfig) -> None:
     last = Path(config.run_dir).resolve() / "checkpoints" / "last.ckpt"
     if last.exists():
         print(f"\ninterrupted: the last whole epoch is in {last}")
@@ -145,10 +145,10 @@ def _require_workable(config: DictConfig) -> None:
     if trainer.gradient_clip_val and "16" in str(trainer.precision) and config.optimizer.get("fused"):
         raise UserError(
             f"trainer.gradient_clip_val={trainer.gradient_clip_val} with trainer.precision={trainer.precision}: "
-            "a fused optimizer clips no gradients of 16 bits\n  change: optimizer.fused=false"
+            "fused optimizers cannot clip gradients in 16-bit precision\n  change: optimizer.fused=false"
         )
     by_steps = config.schedulers[config.scheduler].get("total_steps", 0) is None
-    # Lightning takes null for a thousand epochs, but for none where the time is limited.
+    # To Lightning, max_epochs=null means 1000 epochs, or endless if max_time is set.
     is_endless = trainer.max_epochs == -1 or (trainer.max_epochs is None and trainer.max_time is not None)
     if by_steps and is_endless and trainer.max_steps == -1:
         raise UserError(
@@ -164,10 +164,12 @@ def _require_workable(config: DictConfig) -> None:
     savers = [f"~callbacks.{name}" for name in ("last_checkpoint", "best_checkpoint") if name in config.callbacks]
     if trainer.enable_checkpointing is False and savers:
         raise UserError(
-            f"trainer.enable_checkpointing=false: nothing may save checkpoints\n  change: add {' '.join(savers)}"
+            f"trainer.enable_checkpointing=false: callbacks cannot save checkpoints\n  change: add {' '.join(savers)}"
         )
     if not trainer.logger and "learning_rate" in config.callbacks:
-        raise UserError("trainer.logger=false: nothing takes the learning rate\n  change: add ~callbacks.learning_rate")
+        raise UserError(
+            "trainer.logger=false: there is no logger for the learning rate\n  change: add ~callbacks.learning_rate"
+        )
 
 
 def _require_free(run_folder: Path, resumed: str | None) -> None:
