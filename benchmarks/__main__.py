@@ -1,6 +1,6 @@
-"""All benchmarks, one after another: `python -m benchmarks [--quick] [--kitti FOLDER] [--json FILE]`.
+"""Run all benchmarks one after another: `python -m benchmarks [--quick] [--kitti FOLDER] [--json FILE]`.
 
-`python -m benchmarks.odometry`, or any other of them, runs it alone, with the same options.
+`python -m benchmarks.NAME`, e.g. `benchmarks.odometry`, runs only one of them, with the same options.
 """
 
 from benchmarks import footprint, odometry, posenet, report, simulation, training

@@ -1,4 +1,4 @@
-"""What a user waits for and pays before any scan is registered, and how much memory a long run takes."""
+"""The time until the first scan is registered, and the memory of a long run."""
 
 import statistics
 import subprocess
@@ -21,7 +21,7 @@ import lidarlearn.odometry.odometry as odometry
 odometry.Odometry.register_scan = lambda *_: os._exit(0)
 runpy.run_path({str(_EVALUATE)!r}, run_name="__main__")
 """
-# Linux's own count for this very program: what a process reports to its parent begins with the parent's own memory.
+# Linux's own count of this process: what it reports to its parent includes the memory of the parent before `exec`.
 _WITH_PEAK = f"""
 import runpy
 try:
@@ -33,7 +33,7 @@ finally:
 
 @dataclass(frozen=True)
 class Row:
-    """Seconds or memory of a process of its own."""
+    """Seconds and peak memory of a separate process."""
 
     what: str = column("what")
     seconds: float | None = column("seconds")
@@ -41,7 +41,7 @@ class Row:
 
 
 def measure(options: report.Options) -> list[Row]:
-    """Imports, the start of `evaluate.py`, and an odometry run of 5,000 scans (60 with --quick) of a simulated town."""
+    """Measure imports, the start of `evaluate.py`, and runs of 5,000 scans (60 with --quick) of a simulated town."""
     frames = 60 if options.quick else 5000
     with tempfile.TemporaryDirectory() as folder:
         data = ["data=simulated_urban", f"data.root={folder}", f"data.frames={frames}"]

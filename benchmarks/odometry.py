@@ -1,8 +1,8 @@
-"""Speed and accuracy of the frame-to-model odometries beside KISS-ICP's and small_gicp's, on the same scans.
+"""Speed and accuracy of the frame-to-model odometries, KISS-ICP and small_gicp on the same scans.
 
 `python -m benchmarks.odometry [--quick] [--kitti FOLDER] [--json FILE]`, after `pip install kiss-icp small_gicp`. All
-run in turns in this process, with the scans in memory: files apart, everything counts. Without --kitti only the
-simulated drive is run.
+methods run in turns in this process, with the scans in memory: everything except reading files is measured. Without
+--kitti, only the simulated drive is run.
 """
 
 import statistics
@@ -34,7 +34,7 @@ Runner = Callable[[list[Tensor]], Tensor]  # scans to poses T_world_lidar
 
 @dataclass(frozen=True)
 class Row:
-    """What one method did on one drive: errors, and scans per second also as a share of KISS-ICP's."""
+    """Errors and speed of one method on one drive."""
 
     drive: str = column("drive")
     method: str = column("method")
@@ -46,7 +46,7 @@ class Row:
 
 
 def runner(method: str, device: torch.device) -> Runner:
-    """A method as `evaluate.py` builds it."""
+    """A function that runs a method as `evaluate.py` builds it."""
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
         config = compose("evaluate", ["projection@data.projection=hdl64", f"device={device}"])
 
@@ -58,7 +58,7 @@ def runner(method: str, device: torch.device) -> Runner:
 
 
 def drives(kitti: Path | None, scans: int) -> dict[str, tuple[list[Tensor], Tensor]]:
-    """Scans and true poses of a simulated drive and, given its folder, of KITTI 04."""
+    """Scans and true poses of a simulated drive and, if its folder is given, of KITTI 04."""
     simulated = Drive("urban", seed=1, frames=scans, speed=12.0, static=True, sensor=hdl64())
     found = {"simulated, static": ([s.points for s in track(simulated, "simulating")], simulated.T_world_lidar)}
     if kitti is not None:
@@ -69,7 +69,7 @@ def drives(kitti: Path | None, scans: int) -> dict[str, tuple[list[Tensor], Tens
 
 
 def measure(options: report.Options) -> list[Row]:
-    """Every method on every drive, medians over the rounds."""
+    """Measure every method on every drive; speeds are medians over the rounds."""
     scans, rounds = (8, 1) if options.quick else (50, 5)
     runners = {method: runner(method, options.device) for method in (*BASELINES, *METHODS)}
     rows = []

@@ -1,4 +1,4 @@
-"""How fast PoseNet estimates motions: scan by scan, as `evaluate.py` runs it, and in batches of vertex maps."""
+"""The speed of PoseNet: scan by scan, as `evaluate.py` runs it, and in batches of vertex maps."""
 
 import statistics
 import time
@@ -22,7 +22,7 @@ _ROUNDS = 5
 
 @dataclass(frozen=True)
 class Row:
-    """Motions per second of ResNet-18 on images of a size."""
+    """Motions per second of a ResNet-18 for one size of images."""
 
     work: str = column("work")
     image: str = column("image")
@@ -31,7 +31,7 @@ class Row:
 
 
 def measure(options: report.Options) -> list[Row]:
-    """A network with random weights; what it says does not change what it costs."""
+    """Measure a network with random weights, which is as fast as a trained one."""
     drive = Drive("urban", frames=4 if options.quick else 20, sensor=hdl64())
     scans = [scan.points for scan in drive]
     projection = compose_data_set(["data=simulated_urban"]).projection

@@ -1,4 +1,4 @@
-"""What all benchmarks share: options, the device, tables and the JSON file."""
+"""What all benchmarks share: options, tables and the JSON file."""
 
 import argparse
 import json
@@ -24,12 +24,12 @@ _PACKAGES = ("torch", "kiss-icp", "small-gicp", "open3d")
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line says.
+    """The options of the command line.
 
     Args:
-        quick: a few rounds, for correctness, not for time.
-        kitti: folder of KITTI odometry with sequence 04; None goes without.
-        device: of our own methods and networks.
+        quick: run a few scans once, to check correctness rather than speed.
+        kitti: folder of KITTI odometry with sequence 04; None skips it.
+        device: device of our own methods and networks.
     """
 
     quick: bool
@@ -37,22 +37,22 @@ class Options:
     device: torch.device
 
 
-Rows = Sequence[Any]  # of dataclasses, a `column` for each field; None where there is nothing to measure
+Rows = Sequence[Any]  # dataclasses with a `column` for each field; None if there is nothing to measure
 Benchmark = Callable[[Options], Rows]
 
 
 def column(heading: str) -> Any:
-    """A field of a row, with its heading in the table and its unit in brackets."""
+    """A field of a row with the heading of its column, including the unit in brackets."""
     return field(metadata={"heading": heading})
 
 
 def main(description: str | None, **benchmarks: Benchmark) -> None:
-    """Measure, print a table for each benchmark and, where asked for, write all as JSON.
+    """Run benchmarks, print a table for each and, with --json, write all of them to a file.
 
-    A benchmark that fails does not take from the others what they measured; the exit code tells of it.
+    If a benchmark fails, the others still run, and the exit code is 1.
     """
     parser = argparse.ArgumentParser(_program(), description=(description or "").partition("\n")[0].partition(": `")[0])
-    parser.add_argument("--quick", action="store_true", help="a few scans, once: for correctness, not for time")
+    parser.add_argument("--quick", action="store_true", help="a few scans once, to check correctness, not speed")
     parser.add_argument("--kitti", type=Path, help="folder of KITTI odometry with sequence 04")
     parser.add_argument("--json", type=Path, help="file to write the tables to")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda")
@@ -75,17 +75,17 @@ def main(description: str | None, **benchmarks: Benchmark) -> None:
 
 
 def _program() -> str:
-    """As it was called: argparse alone would say "__main__.py"."""
+    """The program as it was called; argparse alone would print "__main__.py"."""
     spec = sys.modules["__main__"].__spec__
     return Path(sys.argv[0]).name if spec is None else f"python -m {spec.name.removesuffix('.__main__')}"
 
 
 class BenchmarkError(Exception):
-    """What was measured is wrong, not merely slow.
+    """A result is wrong, not merely slow.
 
     Args:
         problem: what is wrong.
-        rows: what was measured.
+        rows: the measured rows.
     """
 
     def __init__(self, problem: str, rows: Rows) -> None:
@@ -94,7 +94,7 @@ class BenchmarkError(Exception):
 
 
 def about(options: Options) -> dict[str, Any]:
-    """Where the figures come from."""
+    """The machine and the software behind the figures."""
     device = torch.cuda.get_device_name() if options.device.type == "cuda" else "cpu"
     found = {"python": platform.python_version(), "platform": platform.platform(), "device": device, "cpu": _cpu()}
     for package in _PACKAGES:
@@ -106,7 +106,7 @@ def about(options: Options) -> dict[str, Any]:
 
 
 def _cpu() -> str:
-    """Name of the processor; Linux tells it here alone."""
+    """Name of the processor, which Linux states only in this file."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -114,7 +114,7 @@ def _cpu() -> str:
 
 
 def show(title: str, rows: Rows) -> None:
-    """The rows as a table; columns without any value are left out."""
+    """Print the rows as a table, without empty columns."""
     table = Table(title=title)
     columns = [f for f in fields(rows[0]) if any(getattr(row, f.name) is not None for row in rows)] if rows else []
     for f in columns:

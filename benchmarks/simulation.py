@@ -1,4 +1,4 @@
-"""What a simulated scan costs, compared with bare ray casting of as many rays."""
+"""The cost of a simulated scan, compared with bare ray casting of the same number of rays."""
 
 import os
 import tempfile
@@ -19,7 +19,7 @@ from lidarlearn.simulation.sensors import hdl64
 
 @dataclass(frozen=True)
 class Row:
-    """What a scan of so many rays costs, and how often the cost of bare ray casting that is."""
+    """Cost per scan, and its ratio to bare ray casting."""
 
     work: str = column("work")
     rays: int = column("rays")
@@ -30,7 +30,7 @@ class Row:
 
 
 def cpu_and_wall_ms(work: Callable[[int], object], scans: int) -> tuple[float, float]:
-    """Processor and wall time of one call [ms], mean over all, in as many threads as make a data set."""
+    """Mean processor and wall time per call [ms], with as many threads as for making a data set."""
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
         wall, cpu = time.perf_counter(), time.process_time()
         list(pool.map(work, range(scans)))
@@ -38,7 +38,7 @@ def cpu_and_wall_ms(work: Callable[[int], object], scans: int) -> tuple[float, f
 
 
 def measure(options: report.Options) -> list[Row]:
-    """A drive through a town with an HDL-64 of 2,000 columns."""
+    """Measure a drive through a town with an HDL-64 of 2,000 columns."""
     scans = 10 if options.quick else 50
     drive = Drive("urban", frames=scans, sensor=hdl64(2000))
     caster = RayCaster(drive.world.static)

@@ -1,8 +1,8 @@
-"""What loading, projection and loss cost a training, compared with the network's bare steps on tensors in memory.
+"""The share of loading, projection and loss in a training, compared with bare steps of the network.
 
-Three kinds of steps are timed in turns: as `train.py` does them, fed from the vertex-map cache (on a GPU with resident
-maps and a compiled loss, its defaults there, and with `trainer.precision=bf16-mixed`); the same on batches in memory;
-and the network's forward and backward pass and the optimizer's step alone, for a loss that costs nothing.
+Three kinds of steps are timed in turns: the steps of `train.py`, fed from the vertex-map cache (on a GPU with resident
+maps, a compiled loss and `trainer.precision=bf16-mixed`); the same steps on batches in memory; and bare steps, which
+are the forward and backward pass of the network with a trivial loss and the step of the optimizer.
 """
 
 import statistics
@@ -29,7 +29,7 @@ _STEPS, _ROUNDS = 12, 5
 
 @dataclass(frozen=True)
 class Row:
-    """Pairs per second from the cache, and as a share of those of the other kinds of steps."""
+    """Pairs per second from the cache, also relative to the other kinds of steps."""
 
     image: str = column("image")
     batch: int = column("batch")
@@ -40,7 +40,7 @@ class Row:
 
 
 def measure(options: report.Options) -> list[Row]:
-    """The default network of simulated drives and the paper's, on scans of a simulated town."""
+    """Measure the default network for simulated drives and the paper's, on scans of a simulated town."""
     frames = 60 if options.quick else 220
     on_gpu = options.device.type == "cuda"
     sizes = ((32, 360, 1024), (64, 720, 512)) if on_gpu else ((32, 360, 16), (64, 720, 8))

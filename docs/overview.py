@@ -1,6 +1,6 @@
-"""The README's picture: a scan as PoseNet sees it, and the map that an odometry makes of a drive.
+"""Draw the picture of the README, docs/images/overview.png, from a simulated drive.
 
-Writes docs/images/overview.png from a simulated drive.
+It shows the map and trajectory of an odometry, and a scan as PoseNet sees it.
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ _SHOWN = 40  # the scan shown as an image
 
 
 def main() -> None:
-    """Drive, register, draw."""
+    """Simulate a drive, register its scans, and draw the picture."""
     drive = Drive("urban", seed=7, frames=220)
     odometry = Odometry(ConstantVelocity(), Backend(GridSampling(), LocalMap(KdTree())))
     poses = torch.stack([odometry.register_scan(scan.points).T_world_lidar for scan in drive])

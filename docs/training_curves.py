@@ -1,4 +1,4 @@
-"""Validation errors over the epochs of several trainings, from their TensorBoard events.
+"""Draw the validation errors of several trainings over the epochs, from their TensorBoard events.
 
 `python docs/training_curves.py RUN RUN ...` writes docs/images/training_curves.png.
 """
@@ -27,7 +27,7 @@ def main(runs: list[Path]) -> None:
 
 
 def curve(events: EventAccumulator, tag: str) -> dict[float, float]:
-    """Value by number of epochs."""
+    """The values of a scalar by the number of epochs."""
     return {float(i + 1): event.value for i, event in enumerate(events.Scalars(tag))}
 
 

@@ -1,4 +1,4 @@
-"""Pictures of the simulated worlds: bird's eye view and range images into docs/images/world_<preset>.png."""
+"""Draw pictures of the simulated worlds, docs/images/world_<preset>.png: bird's-eye views and range images."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ _FRAMES = 200
 
 
 def picture(world: str, seed: int, path: Path) -> None:
-    """Draw the first drive of a world from above, coloured by height, and two of its scans as range images."""
+    """Draw a drive through a world from above, coloured by height, and two of its scans as range images."""
     drive = Drive(world, seed=seed, frames=_FRAMES)
     assert drive.T_world_lidar is not None
     elevations = drive.sensor.elevations_deg
