@@ -12,7 +12,7 @@ from benchmarks.report import column
 from lidarlearn.commands.data import compose_data_set
 from lidarlearn.models.posenet import PoseNet
 from lidarlearn.odometry.initialization.posenet import PoseNetInitialization
-from lidarlearn.odometry.scan_by_scan import InitializationAlone
+from lidarlearn.odometry.initialization_only import InitializationOnly
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import hdl64
 from lidarlearn.training.trained_network import TrainedNetwork
@@ -44,7 +44,7 @@ def measure(options: report.Options) -> list[Row]:
     target = maps[(torch.arange(pairs) + 1) % len(maps)]
 
     def scan_by_scan() -> int:
-        odometry = InitializationAlone(PoseNetInitialization(network), options.device)
+        odometry = InitializationOnly(PoseNetInitialization(network), options.device)
         for points in scans:
             odometry.register_scan(points)
         return len(scans)

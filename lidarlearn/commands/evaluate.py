@@ -29,7 +29,8 @@ from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.submission import is_kitti_test_set, write_submission
 from lidarlearn.evaluation.table_layout import TableLayout
 from lidarlearn.evaluation.trajectory_files import find_trajectories, lidar_poses, read_trajectory
-from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
+from lidarlearn.odometry.base import BaseOdometry
+from lidarlearn.odometry.initialization_only import InitializationOnly
 from lidarlearn.progress import progress
 
 _WITH_NETWORK = ("posenet", "posenet+p_f2m", "cv+p_f2m")
@@ -154,7 +155,7 @@ def configured_method(config: DictConfig, name: str) -> Method:
     return parse_method(name, initializations, list(config.odometry), list(config.baseline))
 
 
-def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
+def build_odometry(config: DictConfig, method: Method) -> BaseOdometry:
     """A new odometry for a method, from the groups `initialization`, `odometry` and `pipeline`, or `baseline`.
 
     A network is built from `initialization.posenet` with the checkpoint of that name in `networks`.
@@ -167,7 +168,7 @@ def build_odometry(config: DictConfig, method: Method) -> ScanByScan:
     else:
         initialization = instantiate(config.initialization[method.initialization])
     if method.backend is None:
-        return InitializationAlone(initialization, config.device)
+        return InitializationOnly(initialization, config.device)
     return instantiate(config.pipeline)(initialization, instantiate(config.odometry[method.backend]))
 
 

@@ -8,11 +8,11 @@ import torch
 
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
+from lidarlearn.odometry.base import BaseOdometry, Frame, Points, Times, as_scan
 from lidarlearn.odometry.health import Health
-from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, as_scan
 
 
-class KissIcp(ScanByScan):
+class KissIcp(BaseOdometry):
     """KISS-ICP.
 
     Args:
@@ -50,7 +50,7 @@ class KissIcp(ScanByScan):
         return Frame(T_world_lidar, health)
 
 
-class SmallGicp(ScanByScan):
+class SmallGicp(BaseOdometry):
     """small_gicp: generalized ICP against an incremental voxel map, initialized by constant velocity. No deskewing.
 
     Args:

@@ -17,8 +17,8 @@ from lidarlearn.data.sequence import Sequence
 from lidarlearn.data.writable import atomic_write
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.trajectory_files import read_trajectory, to_lidar_frame, to_reference_frame
+from lidarlearn.odometry.base import BaseOdometry
 from lidarlearn.odometry.health import Health, write_health
-from lidarlearn.odometry.scan_by_scan import ScanByScan
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Export:
 
 
 def run_odometry(
-    odometry: ScanByScan,
+    odometry: BaseOdometry,
     sequence: Sequence,
     export: Export,
     deskew: bool = False,

@@ -1,4 +1,4 @@
-"""Surface normals from the moments of neighbouring points: in a vertex map, or anywhere else."""
+"""Surface normals from the moments of neighbouring points, in a vertex map or anywhere else."""
 
 from dataclasses import dataclass
 
@@ -131,7 +131,7 @@ def _window_moments(
     rows, columns = window[0] // 2, window[1] // 2
     h, w = channels.shape[-2:]
     ranges = squared_ranges(channels.movedim(0, -1)).sqrt_()
-    ranges = torch.where(ranges > 0, ranges, torch.inf)  # an empty pixel is near no other, empty or not
+    ranges = torch.where(ranges > 0, ranges, torch.inf)  # so that empty pixels have no neighbours
     neighbours, neighbours_ranges = _padded(channels, rows, columns, 0.0), _padded(ranges, rows, columns, torch.inf)
     tolerance = max_range_jump * ranges
     # Separate tensors: for an in-place sum into a part of a tensor, a compiler copies all of it.

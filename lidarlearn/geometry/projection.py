@@ -44,7 +44,7 @@ class SphericalProjection:
     def pixel_index(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch n"]:
         """The pixel of each point, row * width + column as int32; -1 outside the field of view, at the origin, for NaN.
 
-        Infinite points are not handled: odometries and readers leave them out.
+        Infinite points are not supported; odometries and readers drop them.
         """
         # Axis by axis, in place, in 32 bits: a map of a million points is projected at memory speed.
         x, y, z = coordinates = points.detach().movedim(-1, 0).contiguous()
@@ -58,7 +58,7 @@ class SphericalProjection:
 
     def nearest_points(self, points: Float[Tensor, "*batch n 3"]) -> Int[Tensor, "*batch h w"]:
         """Index into `points` of the nearest point of each pixel, -1 where no point fell; see `nearest_per_bin`."""
-        # One bin more, in front, for points outside the image.
+        # An additional first bin holds the points outside the image.
         bins = self.pixel_index(points).add_(1)
         index = nearest_per_bin(bins, squared_ranges(points.detach().float()), self.pixels + 1)[..., 1:].long()
         return index.unflatten(-1, (self.height, self.width))
@@ -78,8 +78,8 @@ def nearest_per_bin(
 ) -> Int[Tensor, "*batch count"]:
     """Index of the point with the smallest range in each bin, -1 in empty bins; int32.
 
-    Deterministic on every device, whatever the order of execution: the minimum of (range, index), packed into one
-    integer, wins, so of equal ranges the smaller index does.
+    Deterministic on every device: the minimum over (range, index), packed into one integer, does not depend on the
+    order of execution. Of equal ranges the smaller index wins.
 
     Args:
         bins: bin of each point, from 0 to `count` - 1.
@@ -94,5 +94,5 @@ def nearest_per_bin(
 
 
 def activated(vertex_map: Float[Tensor, "*batch 3 h w"]) -> Bool[Tensor, "*batch h w"]:
-    """Pixels into which a point fell. Empty pixels are exact zeros in all three coordinates."""
+    """Pixels with a point. Empty pixels are exactly zero in all three coordinates."""
     return (vertex_map != 0).any(dim=-3)

@@ -15,6 +15,6 @@ def squared_ranges(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]
 
 
 def in_range(points: Float[Tensor, "n 3"], min_range_m: float, max_range_m: float) -> Int[Tensor, "m"]:
-    """Indices of the points whose distance from the origin is between two bounds [m]; infinite and NaN are left out."""
+    """Indices of the points whose distance from the origin is between two bounds [m], without infinite and NaN."""
     ranges = squared_ranges(points).sqrt_()
     return ((ranges >= min_range_m) & (ranges <= max_range_m)).nonzero()[:, 0]

@@ -53,7 +53,7 @@ def orthonormalize(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"
 def transform(T_target_source: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch n 3"]) -> Tensor:
     """Points in the target frame, computed in the dtype and on the device of the points.
 
-    The pose may have others: a float64 pose on the CPU moves float32 points on a GPU.
+    The pose may have another dtype and device: a float64 pose on the CPU transforms float32 points on a GPU.
     """
     T = T_target_source.to(points)
     return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
@@ -64,7 +64,7 @@ def transform_map(
 ) -> Float[Tensor, "*batch 3 h w"]:
     """The points of vertex maps in the target frame; empty pixels are transformed like points.
 
-    Written out instead of a matrix product, so that a compiler fuses it and its gradient with the code around.
+    Written out instead of a matrix product, so that a compiler fuses it and its gradient with the surrounding code.
     """
     x, y, z = vertex_map.unsqueeze(-4).unbind(-3)
     T = T_target_source[..., :3, :, None, None].to(vertex_map)

@@ -18,7 +18,7 @@ def voxel_cells(points: Float[Tensor, "*batch 3"], voxel_size_m: float) -> Int[T
 def voxel_keys(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
     """A unique integer for each cell, int32 if that suffices, else int64; ordered by x, then y, then z.
 
-    The bounding box of the cells must have fewer than 2^63.
+    The bounding box of the cells must contain fewer than 2^63 of them.
     """
     if len(cells) == 0:
         return cells[:, 0]
@@ -65,7 +65,7 @@ def _grid_sample_in_graph(
 
 
 def _sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> tuple[Int[Tensor, "n"], Bool[Tensor, "n"]]:
-    """Indices of the points sorted by voxel, and which of them `grid_sample` takes, without reading sizes or extents.
+    """Indices of the points sorted by voxel, and which of them `grid_sample` takes, without waiting for the GPU.
 
     NaN is padding, not a point. Points must be within a million voxels of the origin.
     """
@@ -78,7 +78,7 @@ def _sample(points: Float[Tensor, "n 3"], voxel_size_m: float) -> tuple[Int[Tens
 
 
 def _sorted(keys: Int[Tensor, "n"]) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Bool[Tensor, "n"]]:
-    """The keys in ascending order, the former index of each, and whether it is the first of equal ones."""
+    """The keys in ascending order, the original index of each, and whether it is the first among equal keys."""
     keys, order = torch.sort(keys, stable=True)
     is_first = torch.ones_like(keys, dtype=torch.bool)
     torch.ne(keys[1:], keys[:-1], out=is_first[1:])
@@ -86,10 +86,10 @@ def _sorted(keys: Int[Tensor, "n"]) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"],
 
 
 class VoxelSums:
-    """Sums over the points of each voxel, added in parts; memory grows with the voxels, not with the points.
+    """Sums over the points of each voxel, added part by part; memory grows with the voxels, not with the points.
 
-    Each part is summed by voxel, and merged with the others once they have as many voxels as the merged sums: however
-    many parts there are, each voxel is sorted a few times only.
+    Each part is summed by voxel when added. The parts are merged once together they have as many voxels as the merged
+    sums, so each voxel is sorted only a few times, however many parts there are.
 
     Args:
         columns: number of values per point.

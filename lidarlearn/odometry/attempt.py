@@ -1,4 +1,4 @@
-"""One registration of a scan: the guess it starts from, its result, and what raises doubt about it."""
+"""One registration of a scan: the guess it starts from, its result, and reasons to doubt it."""
 
 import math
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Attempt:
     Args:
         guess: the guess.
         result: the registration.
-        T_previous_new: the motion that it gives.
+        T_previous_new: the registered motion.
         deviation: difference between that motion and constant velocity.
         is_implausible: whether the deviation is more than a vehicle can do in one scan.
         is_degenerate: whether there is too little information along one direction to rely on the motion along it.
@@ -47,12 +47,12 @@ class Attempt:
     is_degenerate: bool
 
     def health(self, frame: int, points: int, status: Status) -> Health:
-        """The health record of a frame, if this is its last attempt.
+        """The health record of a frame whose final attempt this is.
 
         Args:
             frame: index of the scan.
             points: number of points to register.
-            status: what became of the attempt.
+            status: the outcome of the attempt.
         """
         result = self.result
         return Health(

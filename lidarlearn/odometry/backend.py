@@ -32,9 +32,10 @@ class Backend:
         local_map: the scans to register against.
         registration: how scans are registered.
         max_search_distance_m: widest search distance, used where the error of a guess may be large [m].
-        hypothesis_points: number of points with which hypotheses, several initial poses, are tried and compared.
+        hypothesis_points: number of points with which hypotheses, i.e. several initial poses, are compared.
         hypothesis_distance_m: search distance of hypotheses [m]. Wider than the distance between them, so that no pose
-            is missed; but not much wider, or projective association pulls all of them to rest on a motorway.
+            is missed; but not much wider, as projective association would pull all of them to a standstill on a
+            motorway.
     """
 
     sampling: Sampling
@@ -59,15 +60,15 @@ class Backend:
     ) -> RegistrationResult:
         """Register a scan from one guess of its motion.
 
-        Points with times are deskewed by the guess. After the registration they are deskewed by its result, and
-        registered again from there. On a swinging Segway this halves the error of the motion.
+        Points with times are deskewed by the guess and registered, then deskewed by the result and registered again.
+        On a pitching Segway this halves the error of the motion.
 
         Args:
             scan: the new scan.
             T_previous_new: the guess.
             T_world_previous: pose of the previous scan.
             guess_error_m: how far points may be from where the guess puts them [m].
-            motion_per_period: gives the motion over one scan period from that since the previous pose.
+            motion_per_period: converts the motion since the previous pose to that over one scan period.
         """
         final_m = self.registration.search_distance_m
         distance_m = min(final_m + 2 * guess_error_m, self.max_search_distance_m)
@@ -101,8 +102,8 @@ class Backend:
             scan: the new scan.
             T_previous_new: the guesses.
             T_world_previous: pose of the previous scan.
-            deskews: whether points with times are deskewed by each guess, and again by the motion registered from it: a
-                scan of a sudden turn fits nowhere as measured.
+            deskews: whether points with times are deskewed by each guess, and again by the motion registered from it:
+                without that, a scan of a sudden turn fits nowhere.
 
         Returns:
             The motion registered from each guess, and its agreement, see `GaussNewton.agreement`.

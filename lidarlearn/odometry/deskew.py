@@ -15,7 +15,7 @@ def deskew(
     """The points as if all had been measured at the instant of the scan's pose, under constant velocity.
 
     Args:
-        points: as measured [m], each in the sensor's frame of its own instant.
+        points: as measured [m], each in the sensor's frame at its own instant.
         times: time of each point from the instant of the pose, as a share of the scan period, see
             `lidarlearn.data.sequence.Scan`; None: there is nothing to compensate.
         motion_per_period: the motion over one scan period.

@@ -26,11 +26,11 @@ class Health:
         overlap: share of the points that have a neighbour in the map.
         inlier_share: share of these points that lie on the map's surface.
         rmse_m: weighted root mean square of the residuals [m].
-        skew_m: translation, over a scan period, that deskewing left over [m], see `RegistrationResult.skew`.
-        skew_deg: rotation, over a scan period, that deskewing left over [deg].
+        skew_m: translation over a scan period that remains after deskewing [m], see `RegistrationResult.skew`.
+        skew_deg: rotation over a scan period that remains after deskewing [deg].
         min_information: `RegistrationResult.information` along the weakest direction.
         degenerate: whether that is too little to rely on the motion along this direction. Below
-            `registration.min_information` the motion along it is the guess.
+            `registration.min_information` the guess of the motion along it is kept.
         weakest_direction: that direction, a unit vector in the sensor's frame.
         deviation_m: distance between the registered motion and constant velocity [m].
         deviation_deg: angle between the two [deg].

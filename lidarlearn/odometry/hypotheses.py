@@ -8,13 +8,13 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 
-# Up to 108 km/h at 10 Hz, at intervals that ICP bridges; backward as well, for sensors that look back.
+# Up to 108 km/h at 10 Hz, at intervals that ICP can bridge; backward too, for sensors mounted facing backward.
 _FORWARD_M = (-3.0, -2.25, -1.5, -0.75, 0.75, 1.5, 2.25, 3.0)
 _YAWS_DEG = (-25.0, -16.0, -8.0, 8.0, 16.0, 25.0)
 
 
 def start_motions(T_guess: Float[Tensor, "4 4"]) -> Float[Tensor, "h 4 4"]:
-    """Standing still, driving either way at up to 108 km/h, turning on the spot, and the guess unless it is rest."""
+    """Standing still, driving either way at up to 108 km/h, turning on the spot, and the guess unless it is zero."""
     parameters = torch.zeros(1 + len(_FORWARD_M) + len(_YAWS_DEG), 6, dtype=torch.float64)
     parameters[1 : 1 + len(_FORWARD_M), 0] = torch.tensor(_FORWARD_M)
     parameters[1 + len(_FORWARD_M) :, 5] = torch.tensor(_YAWS_DEG) * (math.pi / 180)

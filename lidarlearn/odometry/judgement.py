@@ -18,8 +18,8 @@ class Judgement:
         min_inlier_share: smallest acceptable share of these points that lie on the map's surface.
         min_fit_share: a registration is doubted if its `RegistrationResult.fit` is below this share of the best of the
             last scans, as after a turn so wide that the registration ends at a false fit.
-        min_information_share: likewise of `RegistrationResult.information` in the weakest direction. After a lost scan
-            ground rings may fit on the wrong rings, but then they hardly constrain the motion across them.
+        min_information_share: the same for `RegistrationResult.information` in the weakest direction. After a lost
+            scan, ground rings may fit on the wrong rings, but then they hardly constrain the motion across them.
         min_information: the weakest direction is degenerate below this `RegistrationResult.information`, or below
             `GaussNewton.min_information`. Normals of noisy points look like information: up to 0.013 in a corridor,
             with projective association and 3 cm of noise. A street has 0.04 and more, a motorway as little as 0.004.
@@ -27,9 +27,8 @@ class Judgement:
             acceleration of 50 m/s^2.
         max_deviation_deg: largest plausible change of rotation from one scan to the next [deg].
         min_gain: an implausible change of motion is accepted only if its `GaussNewton.agreement` exceeds that of the
-            unchanged motion by this much; smaller changes need proportionally less. After a turn by 20 deg it exceeds
-            it by 0.2. On a motorway, registered to the previous scan alone, standing still agrees by up to 0.02 better
-            than driving.
+            unchanged motion by this much; smaller changes need proportionally less. A turn by 20 deg gains 0.2. On a
+            motorway, in frame-to-frame registration, standing still agrees up to 0.02 better than driving.
         restart_after: number of scans in a row without an acceptable registration after which a new map is started.
     """
 

@@ -14,7 +14,7 @@ class LocalMap:
         association: holds the scans and searches them.
         size: number of scans in the map.
         key_frame_distance_m: a scan is added once the sensor has moved this far from the last key frame [m]...
-        key_frame_angle_deg: ...or turned by this angle [deg]. 0 switches one of them off; with both 0 every scan is
+        key_frame_angle_deg: ...or turned by this angle [deg]. 0 disables a criterion; with both 0 every scan is
             added.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood": k = 30.

@@ -12,23 +12,23 @@ from lidarlearn.geometry import se3
 from lidarlearn.geometry.ranges import in_range
 from lidarlearn.odometry.attempt import Attempt, Guess
 from lidarlearn.odometry.backend import Backend
+from lidarlearn.odometry.base import BaseOdometry, Frame, Points, Times, are_shares_of_a_period, as_scan
 from lidarlearn.odometry.health import Health, Status
 from lidarlearn.odometry.hypotheses import start_motions, surprise_motions
 from lidarlearn.odometry.initialization.base import Initialization
 from lidarlearn.odometry.judgement import Judgement
 from lidarlearn.odometry.sampling import SampledScan
-from lidarlearn.odometry.scan_by_scan import Frame, Points, ScanByScan, Times, are_shares_of_a_period, as_scan
 from lidarlearn.registration.result import RegistrationResult
 
 _CLOSE_GUESS_ERROR_M = 0.1  # `Guess.error_m` of a motion that was found among several, or of the last one
 
 
-class Odometry(ScanByScan):
+class Odometry(BaseOdometry):
     """Registers each scan, from an initial guess of its motion, against a local map of the scans before it.
 
     Args:
         initialization: guesses the motion.
-        backend: samples, registers and keeps the map; a map of another drive is cleared.
+        backend: samples, registers and keeps the map, which is cleared first.
         judgement: when a registration is accepted, and when it is doubted.
         min_range_m: closer points are dropped, as they lie on the vehicle [m].
         max_range_m: farther points are dropped [m].
@@ -57,7 +57,7 @@ class Odometry(ScanByScan):
         self._recovery = recovery
         self._device = torch.device(device)
         self._T_world_lidar = se3.identity()
-        self._last_motion = se3.identity()  # over one scan period; the last one that was believed
+        self._last_motion = se3.identity()  # over one scan period; the last one that was plausible or confirmed
         self._doubted_motion: Tensor | None = None
         self._first_scan: _FirstScan | None = None  # of the map, until another scan is registered to it
         self._guess_errors_m: deque[float] = deque(maxlen=5)
@@ -86,7 +86,7 @@ class Odometry(ScanByScan):
 
     @property
     def _is_starting(self) -> bool:
-        """Whether the map holds a single scan: not deskewed yet, and no motion is known since."""
+        """Whether the map holds its first scan only, not deskewed yet, so that no motion is known."""
         return self._first_scan is not None
 
     def _in_range(self, points: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -107,7 +107,7 @@ class Odometry(ScanByScan):
         return self._unregistered(scan, "start", "restarted" if self._frames else "ok")
 
     def _register_second_scan(self, scan: SampledScan, first: "_FirstScan", guess: Guess) -> Health:
-        """Register a map's second scan, trying motions of all kinds: there is no last motion to predict from."""
+        """Register a map's second scan, trying many motions, as there is no last one to predict from."""
         if self._recovery:
             motion = self._search(scan, start_motions(guess.T_previous_new))
             guess = Guess(motion, "start", _CLOSE_GUESS_ERROR_M)
@@ -116,7 +116,7 @@ class Odometry(ScanByScan):
         return self._register_and_update(scan, guess)
 
     def _deskew_first_scan(self, first: "_FirstScan", scan: SampledScan, guess: Guess) -> None:
-        """Deskew the map's first scan once the motion is known; its distortion would stay in every later pose."""
+        """Deskew the map's first scan once the motion is known; its distortion would affect every later pose."""
         attempt = self._register(scan, guess)
         if self._judgement.accepts(attempt.result):
             points = first.scan.deskewed(self._motion_per_period(attempt.T_previous_new))
@@ -162,7 +162,7 @@ class Odometry(ScanByScan):
         return attempt.is_degenerate and not self._judgement.is_plausible(guessed)
 
     def _recover(self, scan: SampledScan, doubtful: Attempt) -> Attempt:
-        """The most credible of a doubtful registration, one from the last motion and one from the best of many."""
+        """The most credible of a doubtful registration, one from the last motion and one from the best of several."""
         attempts, T_guess = [doubtful], doubtful.guess.T_previous_new
         if not torch.equal(T_guess, self._last_motion):
             attempts.append(self._register(scan, Guess(self._last_motion, "recovery", _CLOSE_GUESS_ERROR_M)))
@@ -210,8 +210,8 @@ class Odometry(ScanByScan):
     def _motion_per_period(self, motion: Tensor) -> Tensor:
         """The motion over one scan period, from that since the previous pose.
 
-        They differ where scans were lost after a map's first one: their poses are predicted without a known motion, so
-        the motion since the first scan is shared out evenly.
+        They differ if scans were lost right after a map's first one: their poses are predicted without a known motion,
+        so the motion since the first scan is spread evenly.
         """
         if self._first_scan is None or not self._coasted:
             return motion

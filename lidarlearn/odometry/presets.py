@@ -20,7 +20,7 @@ def kd_f2m(projection: SphericalProjection, size: int = 30, device: torch.device
     """Kd-F2M: the nearest point of the last scans, aggregated on a grid, by a KdTree.
 
     Args:
-        projection: the sensor's image, one row a beam.
+        projection: the sensor's image, one row per beam.
         size: number of scans in the map.
         device: where the map is kept.
     """
@@ -28,10 +28,10 @@ def kd_f2m(projection: SphericalProjection, size: int = 30, device: torch.device
 
 
 def vh_f2m(projection: SphericalProjection, size: int = 30, device: torch.device | str = "cpu") -> Backend:
-    """VH-F2M: the same by the table of voxels that keeps the map up.
+    """VH-F2M: the same, but searched through the hash table of the voxel map.
 
     Args:
-        projection: the sensor's image, one row a beam.
+        projection: the sensor's image, one row per beam.
         size: number of scans in the map.
         device: where the map is kept and searched.
     """

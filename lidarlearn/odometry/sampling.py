@@ -22,11 +22,11 @@ _PADDING = Padding()
 
 @dataclass(frozen=True)
 class SampledScan:
-    """What is used of a scan, as measured.
+    """The sampled points of a scan, as measured.
 
     Args:
         points: points for the map [m].
-        times: share of the scan period of each, see `lidarlearn.data.sequence.Scan`.
+        times: time of each, as a share of the scan period, see `lidarlearn.data.sequence.Scan`; None if unknown.
         queries: indices, ascending, of the points that are also registered.
     """
 
@@ -41,9 +41,10 @@ class SampledScan:
 
     @functools.cached_property
     def phases(self) -> Float[Tensor, "n"]:
-        """When each point was measured, as a share of the scan period: its time or, where unknown, after its azimuth.
+        """When each point was measured, as a share of the scan period; derived from the azimuth if times are unknown.
 
-        A LiDAR turns clockwise as seen from above. Where the turn begins nobody says; a pose is that of the middle.
+        LiDARs turn clockwise as seen from above. Where a turn begins is unknown; the pose is taken to be that of its
+        middle, at azimuth 0.
         """
         if self.times is not None:
             return self.times
@@ -52,10 +53,10 @@ class SampledScan:
     def deskewed(
         self, motion_per_period: Float[Tensor, "4 4"], skew: Float[Tensor, "6"] | None = None
     ) -> Float[Tensor, "n 3"]:
-        """All points, compensated for the motion over one scan period, and for what was left over of it.
+        """All points, compensated for the motion over one scan period and for the skew that remained.
 
         Args:
-            motion_per_period: the motion; scans without times are compensated already.
+            motion_per_period: the motion; ignored for scans without times, which are compensated already.
             skew: see `RegistrationResult.skew`.
         """
         if skew is None or not skew.any():
@@ -69,7 +70,7 @@ class Sampling(ABC):
 
     @property
     def neighbourhood_m(self) -> float:
-        """Edge of the voxels whose points, and those of the voxels around, span a surface [m]."""
+        """Edge of the voxels for normals: these are estimated from a voxel and those around it [m]."""
         return _NEIGHBOURHOOD_M
 
     @abstractmethod
@@ -78,7 +79,7 @@ class Sampling(ABC):
 
         Args:
             points: the scan [m].
-            times: when each was measured; None where there is nothing to compensate.
+            times: time of each point, as a share of the scan period; None: there is nothing to compensate.
         """
 
 
@@ -102,7 +103,7 @@ class GridSampling(Sampling):
 
     @property
     def neighbourhood_m(self) -> float:
-        """No finer than the points are kept."""
+        """At least the edge of the map's voxels [m]."""
         return max(super().neighbourhood_m, self.map_voxel_m)
 
     def sample(self, points: Tensor, times: Tensor | None = None) -> SampledScan:
@@ -118,11 +119,11 @@ class GridSampling(Sampling):
 
 @dataclass(frozen=True)
 class ImageSampling(Sampling):
-    """The nearest point of every pixel; as many of them as asked for, evenly spread, are registered.
+    """The nearest point of every pixel for the map; some of these, evenly spread, are registered.
 
     Args:
         projection: the image.
-        max_queries: how many points are registered at most.
+        max_queries: largest number of points to register.
 
     Source: Dellenbach et al. 2021, IV-A: "this resolution acts as a spherical sampler".
     """

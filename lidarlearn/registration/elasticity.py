@@ -1,4 +1,4 @@
-"""Residual motion distortion: motion within a scan that deskewing left over."""
+"""Residual motion distortion: motion within a scan that remains after deskewing."""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,9 +16,9 @@ _MIN_VARIANCE_M2 = 1e-6  # of the residuals
 class Elasticity:
     """Prior on the residual motion of a scan, its skew.
 
-    Deskewing assumes constant velocity; as published, two scans of five in KITTI 04 stay distorted by 9 cm from
-    beginning to end. The rest is modelled as a twist proportional to time and estimated with the last Gauss-Newton
-    step. The prior keeps it small: a skew that all scans share hardly shows against a map of these scans.
+    Deskewing assumes constant velocity; of the published scans of KITTI 04, two in five remain distorted by 9 cm from
+    beginning to end. This motion is modelled as a twist proportional to time and estimated with the last Gauss-Newton
+    step. The prior keeps it small, as a skew that all scans share hardly shows against a map of these scans.
 
     Args:
         translation_m: standard deviation of the skew over a scan period along each axis [m].
@@ -49,7 +49,7 @@ class Elasticity:
         prior_variance = np.repeat([self.translation_m, math.radians(self.rotation_deg)], 3) ** 2
         prior_information = self.points_per_measurement * (variance + _MIN_VARIANCE_M2)[..., None] / prior_variance
         H_skew = within[..., :6, :6] + prior_information[..., None] * np.eye(6)
-        gain = np.linalg.solve(H_skew, across[..., :6, :])  # by the step of the pose, and without a step
+        gain = np.linalg.solve(H_skew, across[..., :6, :])  # for each component of the pose's step, and for no step
         return ElasticEquations(
             pose=replace(
                 rigid,
@@ -73,5 +73,5 @@ class ElasticEquations:
     gain: Float64[np.ndarray, "*batch 6 7"]
 
     def skew(self, step: Float64[np.ndarray, "*batch 6"]) -> Float64[np.ndarray, "*batch 6"]:
-        """The skew that goes with a step of the pose: a twist over a scan period, (translation [m], rotation [rad])."""
+        """The skew for a step of the pose: a twist over a scan period, (translation [m], rotation [rad])."""
         return -(self.gain[..., :6] @ step[..., None])[..., 0] - self.gain[..., 6]

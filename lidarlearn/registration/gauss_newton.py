@@ -121,7 +121,7 @@ class GaussNewton:
             if is_final_distance:
                 is_small = (step_sizes(step) < self._tolerances).all(-1)
                 converged = np.asarray(converged | (is_small & (equations.H != 0).any((-2, -1))))
-            if converged.all():  # the last equations describe the result, but for a small step
+            if converged.all():  # the last equations describe the result up to a small step
                 break
         else:
             T_linearized, equations = T, matching.equations(queries, T, self.search_distance_m, neighbours)

@@ -33,7 +33,7 @@ class Queries:
     normals: Float[Tensor, "n 3"] | None
 
     def every(self, stride: int) -> "Queries":
-        """Every n-th of them."""
+        """Every n-th point."""
         return Queries(self.points[::stride], None if self.normals is None else self.normals[::stride])
 
 
@@ -44,7 +44,7 @@ class Matching:
     Args:
         residual: what is minimized.
         weight: the robust weight.
-        search_distance_m: the final search distance [m]. While the search is wider, the weight's scale is, too.
+        search_distance_m: the final search distance [m]. While the search is wider, so is the scale of the weight.
         association: the map.
     """
 

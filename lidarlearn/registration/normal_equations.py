@@ -1,6 +1,7 @@
 """Normal equations of one Gauss-Newton iteration, and how well they determine the position of a scan.
 
-Six unknowns are solved with numpy on the CPU: sooner than a GPU would begin, and three times as fast as by torch.
+Six unknowns are solved with numpy on the CPU, in less time than a GPU needs to start, and three times as fast as with
+torch.
 """
 
 import functools
@@ -91,7 +92,7 @@ class NormalEquations:
         H: Hessian of half the weighted sum of squared residuals.
         g: gradient of the same.
         squares: the weighted sum of squared residuals [m^2].
-        terms: what is summed up.
+        terms: the per-point quantities behind the sums.
         points: number of points, with or without a neighbour.
     """
 
@@ -110,8 +111,8 @@ class NormalEquations:
     @functools.cached_property
     def localizability(self) -> Localizability:
         """How well they determine the position."""
-        # The ridge keeps an empty system solvable. It is far below any information, but above the rounding of the
-        # Jacobians, so that what nothing determines stays, such as the yaw on a bare plane.
+        # The ridge keeps an empty system solvable. It is far below any information, but above the rounding errors of
+        # the Jacobians, so that undetermined parameters keep their values, such as the yaw on a bare plane.
         ridge = np.diagonal(self.H, axis1=-2, axis2=-1) @ _MEANS * 1e-6 + 1e-9
         covariance = np.linalg.inv(self.H + ridge[..., None] * _EYE)
         negative_variances, directions = np.linalg.eigh(-covariance[..., :3, :3])

@@ -8,14 +8,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RegistrationResult:
-    """The pose at which a scan fits, and the figures by which to judge whether it does.
+    """The pose at which a scan fits the map, and measures of how well it fits.
 
     Tensors have the batch shape of the initial poses and are on the CPU.
 
     Args:
         T_world_lidar: the registered poses, float64.
-        skew: motion over a scan period that deskewing left over, as a twist (translation [m], rotation [rad]) in the
-            sensor's frame, see `Elasticity`; zero if it was not estimated.
+        skew: motion over a scan period that remains after deskewing, as a twist (translation [m], rotation [rad]) in
+            the sensor's frame, see `Elasticity`; zero if it was not estimated.
         iterations: number of Gauss-Newton steps; of a batch, those of the slowest.
         converged: whether the last step was below the tolerances, at the final search distance.
         overlap: share of the points that have a map neighbour with a normal within the search distance.
@@ -26,7 +26,7 @@ class RegistrationResult:
         hessian: of half the weighted sum of squared residuals, by (translation [m], rotation [rad]) in the sensor's
             frame.
         information: weighted share of all points whose residual changes noticeably when the position moves along each
-            principal axis of its covariance, ascending. 0 along a corridor: nothing shows such a move.
+            principal axis of its covariance, ascending. 0 along a corridor, where such a move changes no residual.
         weakest_direction: the axis with the least information, a unit vector in the sensor's frame.
     """
 

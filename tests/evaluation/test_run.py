@@ -10,8 +10,8 @@ from lidarlearn.data.sequence import Scan
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.run import Export, read_export, run_odometry, summarize_health
 from lidarlearn.geometry import se3
+from lidarlearn.odometry.base import BaseOdometry, Frame
 from lidarlearn.odometry.health import Health
-from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
 from tests.evaluation.conftest import DriveWithoutScans
 
 
@@ -26,7 +26,7 @@ class Numbered(DriveWithoutScans):
         return Scan(torch.full((index + 1, 3), 5.0), torch.zeros(index + 1))
 
 
-class OneMetreAScan(ScanByScan):
+class OneMetreAScan(BaseOdometry):
     """Says it moved by a metre, and remembers what it was fed with."""
 
     def __init__(self) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.evaluate import build_odometry, configured_method
 from lidarlearn.geometry import se3
-from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
+from lidarlearn.odometry.base import BaseOdometry, Frame
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl32, hdl64, os1_64, vlp16
@@ -26,7 +26,7 @@ SMALL = hdl64(columns=512)
 SENSORS = {"hdl64": hdl64(columns=1024), "hdl32": hdl32(), "vlp16": vlp16(), "os1_64": os1_64()}
 
 
-def build(name: str, *overrides: str, projection: str = "hdl64") -> ScanByScan:
+def build(name: str, *overrides: str, projection: str = "hdl64") -> BaseOdometry:
     """A fresh odometry, e.g. "cv+kd_f2m", as `evaluate.py` builds it."""
     config = composed(f"projection@data.projection={projection}", *overrides)
     return build_odometry(config, configured_method(config, name))
@@ -38,7 +38,7 @@ def composed(*overrides: str) -> DictConfig:
         return compose("evaluate", ["device=cpu", *overrides])
 
 
-def run(odometry: ScanByScan, scans: Iterable[Tensor]) -> list[Frame]:
+def run(odometry: BaseOdometry, scans: Iterable[Tensor]) -> list[Frame]:
     """One frame per scan."""
     return [odometry.register_scan(points) for points in scans]
 

@@ -6,8 +6,9 @@ import torch
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.models.posenet import PoseNet
+from lidarlearn.odometry.base import BaseOdometry
 from lidarlearn.odometry.initialization.posenet import PoseNetInitialization
-from lidarlearn.odometry.scan_by_scan import InitializationAlone, ScanByScan
+from lidarlearn.odometry.initialization_only import InitializationOnly
 from lidarlearn.registration.association import point_buffer
 from lidarlearn.training.trained_network import TrainedNetwork
 from tests import fake_cuda_graphs
@@ -17,7 +18,7 @@ from tests.odometry.odometries import build, motion_errors, poses, run, scans, s
 captured = pytest.mark.parametrize("association", ["vh", "p"])
 
 
-def built(backend: str, *overrides: str) -> ScanByScan:
+def built(backend: str, *overrides: str) -> BaseOdometry:
     """Every step uses all points, as with CUDA graphs."""
     return build(f"cv+{backend}", f"odometry.{backend}.registration.coarse_stride=1", *overrides)
 
@@ -65,9 +66,9 @@ def test_other_settings_are_captured_or_run_eagerly(group, option, monkeypatch):
 
 def test_a_network_estimates_the_same(monkeypatch):
     network = TrainedNetwork(PoseNet().eval(), SphericalProjection(), torch.device("cpu"))
-    eager = poses(run(InitializationAlone(PoseNetInitialization(network)), scans()[:5]))
+    eager = poses(run(InitializationOnly(PoseNetInitialization(network)), scans()[:5]))
     graphs = fake_cuda_graphs.install(monkeypatch)
-    replayed = poses(run(InitializationAlone(PoseNetInitialization(network)), scans()[:5]))
+    replayed = poses(run(InitializationOnly(PoseNetInitialization(network)), scans()[:5]))
     assert len(graphs) == 2
     torch.testing.assert_close(replayed, eager, rtol=0, atol=1e-6)
     assert not torch.equal(eager[1], se3.identity())
@@ -80,6 +81,6 @@ def test_a_gpu_predicts_the_same_motions():
     trajectories = []
     for device in (torch.device("cpu"), torch.device("cuda")):
         trained = TrainedNetwork(network.to(device), projection, device)
-        trajectories.append(poses(run(InitializationAlone(PoseNetInitialization(trained), device), scans_)))
+        trajectories.append(poses(run(InitializationOnly(PoseNetInitialization(trained), device), scans_)))
     translations, angles = motion_errors(*trajectories)
     assert translations.max() < 1e-3 and angles.max() < 1e-2

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.odometry.scan_by_scan import Frame, ScanByScan
+from lidarlearn.odometry.base import BaseOdometry, Frame
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor
@@ -31,7 +31,7 @@ def loop() -> Drive:
     return Drive(scenes.room(), poses=path, frames=60, sensor=TINY)
 
 
-def looping(odometry: ScanByScan, count: int) -> Iterator[Frame]:
+def looping(odometry: BaseOdometry, count: int) -> Iterator[Frame]:
     """The frames of an endless drive; on the way it must never be lost."""
     tiny, true = scans_of(loop()), loop().T_world_lidar
     previous = se3.identity()

@@ -15,7 +15,7 @@ from lidarlearn.geometry import se3
 from lidarlearn.odometry import Backend, GridSampling, LocalMap, Odometry
 from lidarlearn.odometry.beam_spacing import map_voxel_m
 from lidarlearn.odometry.initialization import ConstantVelocity, Initialization, InitialMotion
-from lidarlearn.odometry.scan_by_scan import InitializationAlone
+from lidarlearn.odometry.initialization_only import InitializationOnly
 from lidarlearn.registration.association import KdTree
 from lidarlearn.registration.gauss_newton import GaussNewton
 from lidarlearn.registration.residuals import GeneralizedIcp
@@ -108,7 +108,7 @@ def test_an_initialization_may_do_with_the_last_motion_what_it_likes(alone):
 
     def odometry(initialization):
         if alone:
-            return InitializationAlone(initialization)
+            return InitializationOnly(initialization)
         return Odometry(initialization, Backend(GridSampling(), LocalMap(KdTree())))
 
     assert torch.equal(*(poses(run(odometry(i), scans()[:4])) for i in (Spoiling(), ConstantVelocity())))

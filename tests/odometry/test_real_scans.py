@@ -15,7 +15,7 @@ from lidarlearn.data.pose_files import as_transforms, read_kitti_poses
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.geometry import se3
 from lidarlearn.metrics.absolute import ape_rmse
-from lidarlearn.odometry.scan_by_scan import Frame
+from lidarlearn.odometry.base import Frame
 from tests.odometry.odometries import ASSOCIATIONS, build, composed, motion_errors, poses, run
 
 pytestmark = pytest.mark.realdata

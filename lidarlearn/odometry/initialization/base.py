@@ -14,7 +14,7 @@ class InitialMotion:
 
     Args:
         T_previous_new: the motion, float64, on the CPU like all poses of an odometry.
-        source: name of the initialization that made the guess, perhaps a fallback of another; only shown in the health
+        source: name of the initialization that made the guess, which may be a fallback; only shown in the health
             record.
     """
 

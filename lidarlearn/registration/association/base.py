@@ -118,8 +118,8 @@ class Association(ABC):
             points_world: points [m], in the map's frame.
             max_distance_m: search distance [m].
             last: the previous result for the same points in the same map. A point that moved less than half the gap to
-                its second-nearest candidate keeps its neighbour; results do not change, only the work. Ignored if it
-                has another number of points, or where a new search of all is faster.
+                its second-nearest candidate keeps its neighbour, which saves work and does not change results. Ignored
+                if its number of points differs, or where searching for all points again is faster.
         """
         if self.is_empty:
             nothing = torch.zeros_like(points_world)
@@ -136,7 +136,7 @@ class Association(ABC):
         return Correspondences(points, self.normals_at(index), within & (neighbours.index >= 0), neighbours)
 
     def bins(self, points_world: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-        """Which part of the map each point searches; all of it unless overridden."""
+        """The part of the map that each point searches; the whole map unless overridden."""
         return torch.zeros(len(points_world), dtype=torch.int64, device=points_world.device)
 
     @abstractmethod

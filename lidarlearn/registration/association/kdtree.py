@@ -9,9 +9,8 @@ from torch import Tensor
 from lidarlearn.registration.association.base import Neighbours
 from lidarlearn.registration.association.voxel_map_association import VoxelMapAssociation
 
-_SEARCH_MARGIN_M = (
-    0.1  # beyond the search distance: points without a neighbour are searched again once they moved this far
-)
+# Beyond the search distance: a point without a neighbour is searched again once it has moved this far.
+_SEARCH_MARGIN_M = 0.1
 _MIN_PARALLEL_QUERIES = 1000  # fewer are answered before a second thread has started
 _LEAF_SIZE = 32  # points; smaller leaves take longer to build, and no less to search
 
@@ -19,7 +18,7 @@ _LEAF_SIZE = 32  # points; smaller leaves take longer to build, and no less to s
 class KdTree(VoxelMapAssociation):
     """The nearest point of a voxel map by scipy's KdTree, rebuilt once per inserted scan.
 
-    The tree is built and searched on the CPU, also where the map is on a GPU.
+    The tree is built and searched on the CPU, even if the map is on a GPU.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood", Kd-F2M.
     """

@@ -25,16 +25,16 @@ _PADDING, _MAP_PADDING = Padding(), Padding(step=1 << 19)
 class Projective(Association):
     """The closest in 3D among the map points that share a query point's pixel of the spherical image.
 
-    Each scan is kept as the points and normals of its vertex map, and projected into a layer of one image: the
+    Each scan is kept as the points and normals of its vertex map, and projected into one layer of an image: the
     candidates of a query are the layers of its pixel. The image has the pose of the last scan or, with a distance
-    between images, that of an earlier scan close by; until the sensor has moved farther, only new scans are projected.
+    between images, that of an earlier scan nearby; until the sensor has moved that far, only new scans are projected.
 
     Args:
         projection: the image, 64x720 px for the HDL-64.
         device: where the map is kept and searched.
         image_distance_m: a scan starts a new image at this distance from the pose of the last image [m]...
-        image_tilt_deg: ...or tilted by this angle against it [deg]. With a distance of 0 every scan does, as in the
-            paper.
+        image_tilt_deg: ...or if it is tilted by this angle against it [deg]. With a distance of 0 every scan starts a
+            new image, as in the paper.
 
     Source: Dellenbach et al. 2021, III-A "Local map and neighborhood", P-F2M.
     """
@@ -140,7 +140,7 @@ class Projective(Association):
         return distance_m >= self._image_distance_m or tilt_deg >= self._image_tilt_deg or len(self._buffer) == 1
 
     def _project(self, layers: int) -> Int[Tensor, "pixels layers"]:
-        """Slot of the nearest point of each scan in each pixel, a layer a scan; -1 for none."""
+        """Slot of the nearest point of each scan in each pixel, one layer per scan; -1 for none."""
         if not cuda_graphs.supported_on(self._device):
             return self._nearest_slots(self._buffer.coordinates, self._buffer.scans, layers)
         count = _MAP_PADDING.length(len(self.points))
@@ -159,7 +159,7 @@ class Projective(Association):
         self, coordinates: Float[Tensor, "3 m"], scans: Int[Tensor, "m"], layers: int
     ) -> Int[Tensor, "pixels layers"]:
         local = _moved(self._T_image_world, coordinates).mT
-        # One pixel more, in front, for points outside the image.
+        # An additional first pixel holds the points outside the image.
         bins = self.projection.pixel_index(local).add_(1).mul_(layers).add_(scans)
         nearest = nearest_per_bin(bins, squared_ranges(local), (self.projection.pixels + 1) * layers)
         nearest = nearest[layers:].unflatten(0, (self.projection.pixels, layers))

@@ -15,7 +15,7 @@ from lidarlearn.registration.association.voxel_map_association import VoxelMapAs
 
 _MAX_CANDIDATES_AT_ONCE = 1 << 19  # bounds the memory of a wide search
 _MAX_CANDIDATES_AT_ONCE_ON_GPU = 1 << 22
-_CHEAP_CANDIDATES = 1 << 16  # are compared faster than the points that need a wider search are selected
+_CHEAP_CANDIDATES = 1 << 16  # up to this many are compared faster than the points that need a wider search are selected
 _MIN_RADIUS = 2  # voxels; wide enough that points without a neighbour need no new search in every iteration
 _MAX_RADIUS = 4  # voxels; a search visits 9^3 of them per point
 
@@ -23,10 +23,10 @@ _MAX_RADIUS = 4  # voxels; a search visits 9^3 of them per point
 class VoxelHash(VoxelMapAssociation):
     """The nearest point in the voxels around the query: exact within the search distance, up to four voxel edges.
 
-    Nothing is built per scan, as the table of the voxel map is the search structure. It is made of tensor operations,
-    for CPU and GPU.
+    Nothing is built per scan, as the table of the voxel map is the search structure. Tensor operations search it on CPU
+    and GPU.
 
-    Source: the option that Dellenbach et al. 2021, III-A "Local map and neighborhood", names as the way to be faster.
+    Source: named as a faster option in Dellenbach et al. 2021, III-A "Local map and neighborhood".
     """
 
     @property
@@ -40,7 +40,7 @@ class VoxelHash(VoxelMapAssociation):
         return next((reach_m for reach_m in reaches if max_distance_m <= reach_m), math.inf)
 
     def nearest(self, points_world: Float[Tensor, "n 3"], bins: Int[Tensor, "n"], max_distance_m: float) -> Neighbours:
-        """Search wider and wider cubes of voxels around each point, until no other point can be nearer."""
+        """Search ever wider cubes of voxels around each point, until no other point can be nearer."""
         if cuda_graphs.supported_on(points_world.device):
             return self._nearest_at_once(points_world, bins, max_distance_m)
         widest = max(_MIN_RADIUS, min(math.ceil(max_distance_m / self._voxel_size_m), _MAX_RADIUS))
@@ -62,7 +62,7 @@ class VoxelHash(VoxelMapAssociation):
         return joined([nearest_two(self._map.slot_coordinates, self._map.around(c, radius, inner), c) for c in chunks])
 
     def _nearest_at_once(self, points_world: Tensor, bins: Tensor, max_distance_m: float) -> Neighbours:
-        """Search all voxels within the distance, without reading intermediate results."""
+        """Search all voxels within the distance, without waiting for intermediate results."""
         reach_m = min(max_distance_m, _MAX_RADIUS * self._voxel_size_m)
         candidates = voxels_reached(reach_m, self._voxel_size_m) ** 3
         chunks = points_world.split(max(_MAX_CANDIDATES_AT_ONCE_ON_GPU // candidates, 1))

@@ -1,6 +1,6 @@
 """A map of the last scans with one point per voxel, and normals that are updated incrementally.
 
-A hash table maps voxels to points. A point stays for k scans; meanwhile its voxel takes no other.
+A hash table maps voxels to points. A point is kept for k scans, in which its voxel accepts no other.
 """
 
 import functools
@@ -23,7 +23,7 @@ from lidarlearn.registration.association.point_buffer import PointBuffer
 # at 0.4 m. So neighbouring voxels never collide, and their entries are close in memory. Of two points that share an
 # entry, as 7 of 97,000 do on a motorway, the later one is found.
 _TABLE_BITS = (9, 9, 6)
-_PADDING = cuda_graphs.Padding(step=1 << 12)  # with NaN, which is no point
+_PADDING = cuda_graphs.Padding(step=1 << 12)  # with NaN, which marks padding
 _MIN_NEIGHBOURS = 5
 _MAX_ROUGHNESS = 0.5  # deviation from the plane, relative to the smaller extent in it
 _MIN_EXTENT = 0.15  # smaller extent in the plane, relative to the voxel size: a line of points has no normal
@@ -80,7 +80,7 @@ class VoxelMap(PointBuffer):
         Args:
             points_world: points [m], in the map's frame.
             radius: number of voxels between the central one and the faces of the cube.
-            inner: `radius` of a smaller cube that is left out; -1: of none.
+            inner: `radius` of a smaller cube that is left out; -1: none.
 
         Returns:
             Slots. An empty voxel, or one whose entry belongs to another voxel, gives an arbitrary point: comparing
@@ -129,7 +129,7 @@ class VoxelMap(PointBuffer):
         x, y, z = torch.where(pairs.is_valid, offsets, 0.0)
         squares = (x * x, x * y, x * z, y * y, y * z, z * z)
         self._moments.index_add_(0, new[pairs.new], torch.stack([count, x, y, z, *squares], dim=1))
-        # Pairs of new points occur twice, once from each side.
+        # Pairs of two new points occur twice, once from each side.
         mirrored = torch.stack([count, -x, -y, -z, *squares], dim=1) * (pairs.neighbour < first)[:, None]
         self._moments.index_add_(0, pairs.neighbour, mirrored)
         self._fit(torch.cat([pairs.neighbour, new]))
