@@ -48,7 +48,7 @@ def _facade(width: float, height: float, bays: int, floors: int, recess: float, 
     xs, zs = (column.ravel() + 0.5) * cell_width - width / 2, floor.ravel() * cell_height
     positions = np.column_stack([xs, np.zeros_like(xs), zs])
     scales = np.tile([cell_width, 1.0, cell_height], (len(xs), 1))
-    return instances(cell, positions, np.zeros(len(xs)), scales)
+    return instances(cell, positions, scales=scales)
 
 
 def _window_cell(recess: float, window: tuple[float, float]) -> Mesh:

@@ -59,14 +59,14 @@ class Drive(Sequence):
         if isinstance(world, World) and poses is None:
             raise ValueError("a world of your own needs poses: Drive(world, poses=...)")
         self.seed, self.static, self.motion_distortion, self.speed = seed, static, motion_distortion, speed
-        self._place = preset("urban" if isinstance(world, World) else world)
+        self._preset = preset("urban" if isinstance(world, World) else world)
         self.world_name = "custom" if isinstance(world, World) else world
-        self.sensor = self._place.sensor() if sensor is None else sensor
+        self.sensor = self._preset.sensor() if sensor is None else sensor
         self.frames = frames if poses is None else min(frames, len(poses))
         self.name = f"{self.world_name}_{seed:02d}" if name is None else name
         # The scenery continues beyond the last scan, but not along all of a long file.
-        self._given = None if poses is None else np.asarray(poses[: frames + 100], dtype=np.float64)
-        self._own = world if isinstance(world, World) else None
+        self._given_poses = None if poses is None else np.asarray(poses[: frames + 100], dtype=np.float64)
+        self._given_world = world if isinstance(world, World) else None
         self.timestamps = torch.arange(self.frames, dtype=torch.float64) * self.sensor.period
         T_map_lidar = torch.from_numpy(self.trajectory.at(self.timestamps.numpy()))
         self.T_world_lidar = torch.linalg.inv(T_map_lidar[0]) @ T_map_lidar
@@ -81,10 +81,10 @@ class Drive(Sequence):
         settings = [simulator_digest(), self.world_name, self.seed, self.frames, sorted(asdict(self.sensor).items())]
         settings += [self.speed, self.static, self.motion_distortion]
         digest = hashlib.sha256(repr(settings).encode())
-        if self._given is not None:
-            digest.update(self._given.tobytes())
-        if self._own is not None:
-            for array in _arrays(self._own):
+        if self._given_poses is not None:
+            digest.update(self._given_poses.tobytes())
+        if self._given_world is not None:
+            for array in _arrays(self._given_world):
                 digest.update(repr((array.shape, array.dtype)).encode() + array.tobytes())
         return digest.hexdigest()[:16]
 
@@ -106,7 +106,7 @@ class Drive(Sequence):
         if not 0 <= index < self.frames:
             raise IndexError(f"{self.name} has scans 0 to {self.frames - 1}, asked for {index}")
         distances, cos_incidence = self._cast(index)
-        return self.sensor.measure(distances, cos_incidence, self._chance(_SCAN, index))
+        return self.sensor.measure(distances, cos_incidence, self._rng(_SCAN, index))
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -116,33 +116,33 @@ class Drive(Sequence):
     @cached_property
     def world(self) -> World:
         """Everything that rays can hit, in the map frame."""
-        if self._own is not None:
-            return self._own
+        if self._given_world is not None:
+            return self._given_world
         trajectory, terrain, track = self._motion
         ego = trajectory.times, trajectory.poses[:, :2, 3]
-        return build_world(self._place, self._chance(_WORLD), terrain, track, ego, self.static)
+        return build_world(self._preset, self._rng(_WORLD), terrain, track, ego, self.static)
 
     @cached_property
     def _motion(self) -> tuple[Trajectory, Terrain, np.ndarray]:
         period = self.sensor.period
-        if self._given is not None:
-            times = period * np.arange(len(self._given))
-            feet = self._given[:, :3, 3] - self._place.vehicle.sensor_height * self._given[:, :3, 2]
+        if self._given_poses is not None:
+            times = period * np.arange(len(self._given_poses))
+            feet = self._given_poses[:, :3, 3] - self._preset.vehicle.sensor_height * self._given_poses[:, :3, 2]
             track = extended(feet, 100.0)
-            return Trajectory(times, self._given), GroundBelow(track), track[:, :2]
-        terrain = Hills(self._chance(_TERRAIN), self._place.slope_deg)
-        rng, start, duration = self._chance(_MOTION), -2 * period, (self.frames + 3) * period
-        if self._place.driving is None:
+            return Trajectory(times, self._given_poses), GroundBelow(track), track[:, :2]
+        terrain = Hills(self._rng(_TERRAIN), self._preset.slope_deg)
+        rng, start, duration = self._rng(_MOTION), -2 * period, (self.frames + 3) * period
+        if self._preset.driving is None:
             motion = motions.segway(rng, start, duration, self.speed)
         else:
-            motion = motions.drive(rng, self._place.driving, start, duration, self.speed)
-        return on_ground(motion, terrain, self._place.vehicle), terrain, motion.track
+            motion = motions.drive(rng, self._preset.driving, start, duration, self.speed)
+        return on_ground(motion, terrain, self._preset.vehicle), terrain, motion.track
 
     @cached_property
     def _caster(self) -> RayCaster:
         return RayCaster(self.world.static)
 
-    def _chance(self, *stream: int) -> np.random.Generator:
+    def _rng(self, *stream: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, *stream])
 
     def _cast(self, index: int) -> tuple[Float[np.ndarray, "beams columns"], Float[np.ndarray, "beams columns"]]:
@@ -194,7 +194,7 @@ def _arrays(world: World) -> Iterator[np.ndarray]:
     for mesh in (world.static, *(mover.mesh for mover in world.movers)):
         yield from (mesh.vertices, mesh.triangles)
     for mover in world.movers:
-        yield from (mover.lane, mover.times, mover.way)
+        yield from (mover.lane, mover.times, mover.travelled)
 
 
 def _seen(

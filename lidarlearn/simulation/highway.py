@@ -34,8 +34,7 @@ def _rails(site: Site, road: Street, offset: float, share: float) -> None:
         if site.rng.random() < share:
             points = np.column_stack([line[start:stop], site.ground(line[start:stop])])
             posts = points[:: int(site.rng.choice([2, 4]))]
-            upright = instances(box(0.12, 0.12, 0.7), posts, np.zeros(len(posts)), np.ones((len(posts), 3)))
-            site.add_world(merge([ribbon(points, 0.32, 0.45), upright]))
+            site.add_world(merge([ribbon(points, 0.32, 0.45), instances(box(0.12, 0.12, 0.7), posts)]))
         start = stop
 
 
@@ -48,8 +47,7 @@ def _barriers(site: Site, road: Street, side: int) -> None:
         line = road.offset(side * (road.half_width + 3.5))[start : start + length : 4]
         points = np.column_stack([line, site.ground(line)])
         height = rng.uniform(2.5, 4)
-        posts = instances(box(0.3, 0.3, height + 0.3), points, np.zeros(len(points)), np.ones((len(points), 3)))
-        site.add_world(merge([ribbon(points, height + 0.5, -0.5), posts]))
+        site.add_world(merge([ribbon(points, height + 0.5, -0.5), instances(box(0.3, 0.3, height + 0.3), points)]))
 
 
 def _across(site: Site, road: Street) -> None:

@@ -21,7 +21,7 @@ class Mesh:
 
     def moved(self, offset: Float[np.ndarray, "3"], yaw: float = 0.0) -> "Mesh":
         """A copy turned by `yaw` [rad] about z, then shifted by `offset` [m]."""
-        return instances(self, offset[None], np.array([yaw]), np.ones((1, 3)))
+        return instances(self, offset[None], np.array([yaw]))
 
 
 def empty() -> Mesh:
@@ -39,10 +39,14 @@ def merge(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def instances(
-    mesh: Mesh, positions: Float[np.ndarray, "k 3"], yaws: Float[np.ndarray, "k"], scales: Float[np.ndarray, "k 3"]
+    mesh: Mesh,
+    positions: Float[np.ndarray, "k 3"],
+    yaws: Float[np.ndarray, "k"] | None = None,
+    scales: Float[np.ndarray, "k 3"] | None = None,
 ) -> Mesh:
-    """`k` copies of a mesh, each scaled along its own axes, turned about z [rad] and shifted [m]."""
-    scaled = mesh.vertices[None] * scales[:, None]
+    """`k` copies of a mesh, each scaled along its own axes, rotated about z [rad] and shifted [m]."""
+    yaws = np.zeros(len(positions)) if yaws is None else yaws
+    scaled = mesh.vertices[None] * (np.ones((len(positions), 3)) if scales is None else scales)[:, None]
     cos, sin = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
     x, y = cos * scaled[..., 0] - sin * scaled[..., 1], sin * scaled[..., 0] + cos * scaled[..., 1]
     vertices = np.stack([x, y, scaled[..., 2]], axis=-1) + positions[:, None]

@@ -17,14 +17,14 @@ class Mover:
     Args:
         mesh: its shape, standing at the origin and facing x.
         lane: points of the line, on the ground [m].
-        times: times at which `way` is given [s].
-        way: arc length along the lane at these times [m]; beyond either end of the lane it is absent.
+        times: times at which `travelled` is given [s].
+        travelled: arc length along the lane at these times [m]; beyond either end of the lane it is absent.
     """
 
     mesh: Mesh
     lane: Float[np.ndarray, "n 3"]
     times: Float[np.ndarray, "k"]
-    way: Float[np.ndarray, "k"]
+    travelled: Float[np.ndarray, "k"]
 
     @cached_property
     def _arc_length(self) -> Float[np.ndarray, "n"]:
@@ -33,7 +33,7 @@ class Mover:
     def position(self, time: float, ahead: float = 0.0) -> Float[np.ndarray, "3"] | None:
         """Its position at a time [s], or the point `ahead` of it on the lane [m]; None while it is absent."""
         end = self._arc_length[-1]
-        here = np.interp(time, self.times, self.way)
+        here = np.interp(time, self.times, self.travelled)
         if not 0 <= here <= end:
             return None
         place = np.clip(here, 1.0, end - 1.0) + ahead
@@ -49,9 +49,6 @@ class Mover:
 
 def snapshot(movers: Sequence[Mover], time: float, centre: Float[np.ndarray, "3"], radius: float) -> list[Mesh]:
     """The meshes of all movers within `radius` [m] of a point at a time [s]."""
-    near = []
-    for mover in movers:
-        position = mover.position(time)
-        if position is not None and np.linalg.norm(position - centre) < radius:
-            near.append(mover.at(time))
-    return [mesh for mesh in near if mesh is not None]
+    positions = ((mover, mover.position(time)) for mover in movers)
+    near = [mover for mover, at in positions if at is not None and np.linalg.norm(at - centre) < radius]
+    return [mesh for mover in near if (mesh := mover.at(time)) is not None]

@@ -18,8 +18,8 @@ def car(rng: np.random.Generator) -> Mesh:
     body = [(rear, 0.3), (rear, belt), (0.22 * length, belt), (bonnet, 0.5 * height), (bonnet, 0.3)]
     tail = rng.uniform(-0.48, -0.33) * length
     cabin = [(tail, belt), (tail + 0.1 * length, height), (0.08 * length, height), (0.25 * length, belt)]
-    wheel = instances(_wheel(0.32), _wheel_positions(length, width), np.zeros(4), np.ones((4, 3)))
-    return merge([extruded(np.array(body), width), extruded(np.array(cabin), width * 0.95, width * 0.75), wheel])
+    shell = [extruded(np.array(body), width), extruded(np.array(cabin), width * 0.95, width * 0.75)]
+    return merge([*shell, _wheels(0.32, length, width)])
 
 
 def van(rng: np.random.Generator) -> Mesh:
@@ -28,8 +28,7 @@ def van(rng: np.random.Generator) -> Mesh:
     front = length / 2
     nose = [(0.62 * front, height), (0.85 * front, 1.1), (front, 0.95), (front, 0.35)]
     outline = [(-front, 0.35), (-front, height), *nose]
-    wheel = instances(_wheel(0.35), _wheel_positions(length, width), np.zeros(4), np.ones((4, 3)))
-    return merge([extruded(np.array(outline), width), wheel])
+    return merge([extruded(np.array(outline), width), _wheels(0.35, length, width)])
 
 
 def lorry(rng: np.random.Generator) -> Mesh:
@@ -37,17 +36,15 @@ def lorry(rng: np.random.Generator) -> Mesh:
     length = rng.uniform(8, 14)
     cab = at(box(2.2, 2.4, 2.6, base=0.5), x=length / 2 - 1.1)
     body = at(box(length - 2.6, 2.5, 2.8, base=1.0), x=-1.3)
-    wheel = instances(_wheel(0.5), _wheel_positions(length, 2.4), np.zeros(4), np.ones((4, 3)))
-    return merge([cab, body, wheel])
+    return merge([cab, body, _wheels(0.5, length, 2.4)])
 
 
-def _wheel(radius: float) -> Mesh:
+def _wheels(radius: float, length: float, width: float) -> Mesh:
+    """The four wheels of a vehicle of this length and width."""
     angle = 2 * np.pi * np.arange(8) / 8
-    return extruded(radius * np.stack([np.cos(angle), 1 + np.sin(angle)], axis=-1), 0.2)
-
-
-def _wheel_positions(length: float, width: float) -> np.ndarray:
-    return np.array([[i * 0.3 * length, j * (width / 2 - 0.12), 0.0] for i in (-1, 1) for j in (-1, 1)])
+    wheel = extruded(radius * np.stack([np.cos(angle), 1 + np.sin(angle)], axis=-1), 0.2)
+    positions = [[i * 0.3 * length, j * (width / 2 - 0.12), 0.0] for i in (-1, 1) for j in (-1, 1)]
+    return instances(wheel, np.array(positions))
 
 
 def pedestrian(rng: np.random.Generator) -> Mesh:
@@ -154,5 +151,5 @@ def fence(rng: np.random.Generator, length: float) -> Mesh:
     height, spacing = rng.uniform(0.9, 1.6), rng.uniform(0.25, 0.5)
     xs = np.arange(-length / 2, length / 2, spacing)
     positions = np.column_stack([xs, np.zeros((len(xs), 2))])
-    pales = instances(box(0.1, 0.04, height), positions, np.zeros(len(xs)), np.ones((len(xs), 3)))
+    pales = instances(box(0.1, 0.04, height), positions)
     return merge([pales, box(length, 0.05, 0.1, base=0.3), box(length, 0.05, 0.1, base=height - 0.2)])

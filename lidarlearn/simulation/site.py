@@ -59,6 +59,11 @@ class Spot:
     along: float
     facing: float
 
+    @property
+    def outward(self) -> Float[np.ndarray, "2"]:
+        """Unit vector away from the street."""
+        return -np.array([np.cos(self.facing), np.sin(self.facing)])
+
 
 class Site:
     """Land with streets, on which a world is built.
@@ -124,8 +129,7 @@ class Site:
 
     def spots(self, street: Street, side: int, beside: float, spacing: tuple[float, float]) -> Iterator[Spot]:
         """Places along one side of a street, `beside` metres from its edge, at random intervals."""
-        _, left = street.frames()
-        along, _ = street.frames()
+        along, left = street.frames()
         i = self.rng.uniform(0, spacing[0])
         while i < len(left):
             k = int(i)

@@ -45,8 +45,7 @@ def _houses(site: Site, street: Street, side: int) -> None:
             continue
         length, depth, height = rng.uniform(8, 24), rng.uniform(8, 13), rng.uniform(3.2, 13)
         setback = rng.choice([rng.uniform(2.4, 4), rng.uniform(4, 11)])
-        outward = -np.array([np.cos(spot.facing), np.sin(spot.facing)])
-        xy = spot.xy + (setback + depth / 2) * outward
+        xy = spot.xy + (setback + depth / 2) * spot.outward
         yaw = spot.facing + np.pi / 2 + rng.normal(scale=0.03)
         make = hall if rng.random() < 0.12 else building
         if site.place(make(rng, length, depth, height), xy, yaw, (length + 1, depth + 1.5), 2.0):
@@ -57,20 +56,18 @@ def _houses(site: Site, street: Street, side: int) -> None:
 
 def _garden(site: Site, spot: Spot, length: float) -> None:
     rng = site.rng
-    outward = -np.array([np.cos(spot.facing), np.sin(spot.facing)])
     make = [objects.wall, objects.fence, objects.hedge][rng.integers(3)]
     extent = 0.7 * length
-    site.place(make(rng, extent), spot.xy + 2.6 * outward, spot.along, (extent, 0.8), 1.6)
+    site.place(make(rng, extent), spot.xy + 2.6 * spot.outward, spot.along, (extent, 0.8), 1.6)
     if rng.random() < 0.6:
-        site.place(objects.bush(rng), spot.xy + rng.uniform(3.2, 4.4) * outward, 0.0, (1.6, 1.6), 2.2)
+        site.place(objects.bush(rng), spot.xy + rng.uniform(3.2, 4.4) * spot.outward, 0.0, (1.6, 1.6), 2.2)
 
 
 def _halls(site: Site, street: Street, side: int) -> None:
     rng = site.rng
     for spot in site.spots(street, side, 0.0, (10.0, 30.0)):
         length, depth, height = rng.uniform(18, 50), rng.uniform(12, 22), rng.uniform(6, 20)
-        outward = -np.array([np.cos(spot.facing), np.sin(spot.facing)])
-        xy = spot.xy + (rng.uniform(5, 22) + depth / 2) * outward
+        xy = spot.xy + (rng.uniform(5, 22) + depth / 2) * spot.outward
         yaw = spot.facing + np.pi / 2 + rng.choice([0, 0, np.pi / 2, rng.uniform(-0.5, 0.5)])
         make = building if rng.random() < 0.75 else hall
         site.place(make(rng, length, depth, height), xy, yaw, (length + 2, depth + 3), 4.0)
@@ -83,8 +80,7 @@ def _parked_cars(site: Site, street: Street, side: int, share: float) -> None:
         if rng.random() < share:
             mesh = objects.van(rng) if rng.random() < 0.12 else objects.car(rng)
             yaw = spot.along + rng.choice([0, np.pi]) + rng.normal(scale=0.03)
-            outward = -np.array([np.cos(spot.facing), np.sin(spot.facing)])
-            site.place(mesh, spot.xy + outward * rng.uniform(0.75, 1.0), yaw, (5.0, 1.7), -0.35)
+            site.place(mesh, spot.xy + spot.outward * rng.uniform(0.75, 1.0), yaw, (5.0, 1.7), -0.35)
 
 
 def _signs(site: Site, street: Street, side: int) -> None:

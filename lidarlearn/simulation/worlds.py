@@ -214,8 +214,8 @@ def _movers(
     for _ in range(place.pedestrians):
         side = rng.choice([-1, 1])
         line = _raised(site, main.offset(side * (main.half_width + rng.uniform(0.8, 1.9)))[:: rng.choice([-1, 1])])
-        way = rng.uniform(0, len(line)) + rng.uniform(0.8, 1.7) * (times - times[0])
-        movers.append(Mover(objects.pedestrian(rng), line, times, way))
+        travelled = rng.uniform(0, len(line)) + rng.uniform(0.8, 1.7) * (times - times[0])
+        movers.append(Mover(objects.pedestrian(rng), line, times, travelled))
     return movers
 
 
