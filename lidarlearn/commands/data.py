@@ -65,9 +65,9 @@ def export_all(overrides: Sequence[str], console: Console, config_folder: str | 
     from lidarlearn.data.export.formats import exporter_of
 
     suffix = next((o.removeprefix("suffix=") for o in overrides if o.startswith("suffix=")), None)
-    theirs_alone = ("to=", "to.", "projection@to.")
-    of_target = [re.sub(r"^(projection@)?to\b", r"\1data", o) for o in overrides if o.startswith(theirs_alone)]
-    of_source = [o for o in overrides if not o.startswith((*theirs_alone, "suffix="))]
+    prefixes = ("to=", "to.", "projection@to.")
+    of_target = [re.sub(r"^(projection@)?to\b", r"\1data", o) for o in overrides if o.startswith(prefixes)]
+    of_source = [o for o in overrides if not o.startswith((*prefixes, "suffix="))]
     source, target = (compose_data_set(side, config_folder) for side in (of_source, of_target))
     exporter = exporter_of(target, suffix)
     theirs = matched_names(source, target)
@@ -75,16 +75,16 @@ def export_all(overrides: Sequence[str], console: Console, config_folder: str | 
         exporter.require_new(name)
     source.prepare(theirs)
     drives = source.sequences(theirs)
-    for mine, drive in drives.items():  # all of them first: half an export would block the next attempt
+    for mine, drive in drives.items():  # check all first: a partial export would block the next attempt
         exporter.require(drive, theirs[mine])
     for mine, drive in drives.items():
         exporter.export(drive, theirs[mine])
         console.print(f"{mine} -> {theirs[mine]}: {len(drive)} scans", markup=False)
     if left_out := [name for name in source.names if name not in theirs]:
         console.print(f"left out, {target.title} has no more names for them: {', '.join(left_out)}", markup=False)
-    folder = [] if config_folder is None else ["--config-dir", config_folder]  # all overrides on one side of it
+    folder = [] if config_folder is None else ["--config-dir", config_folder]  # before all overrides
     words = ["python", "train.py", *folder, *of_target]
-    if not any("projection" in o.partition("=")[0] for o in of_target):  # of the sensor of the scans
+    if not any("projection" in o.partition("=")[0] for o in of_target):  # that of the exported scans
         ours, default = asdict(source.projection), asdict(target.projection)
         words += [f"data.projection.{key}={ours[key]}" for key in ours if ours[key] != default[key]]
     for role in _ROLES:
