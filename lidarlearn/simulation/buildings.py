@@ -3,7 +3,6 @@
 import numpy as np
 
 from lidarlearn.simulation.meshes import Mesh, box, cylinder, instances, merge
-from lidarlearn.simulation.objects import at
 
 
 def building(rng: np.random.Generator, length: float, depth: float, height: float) -> Mesh:
@@ -26,7 +25,7 @@ def building(rng: np.random.Generator, length: float, depth: float, height: floa
         (-np.pi / 2, depth, length / 2),
     ):
         facade = _facade(width, height, max(1, round(width / bay)), floors, recess, window)
-        walls.append(at(facade.moved(np.array([0, -distance, 0.0])), yaw=yaw))
+        walls.append(facade.moved(y=-distance).moved(yaw=yaw))
     plinth = box(length + 0.1, depth + 0.1, 3.0, base=-2.5)  # reaches below sloping ground
     return merge([*walls, plinth, _roof(rng, length, depth, height), *_front(rng, length, depth, height, floors)])
 
@@ -35,8 +34,8 @@ def hall(rng: np.random.Generator, length: float, depth: float, height: float) -
     """A plain hall with pilasters, such as a workshop, a sports hall or a supermarket."""
     spacing = rng.uniform(4, 7)
     xs = np.arange(-length / 2 + 0.3, length / 2, spacing)
-    pilasters = [at(box(0.5, depth + 0.7, height), x=x) for x in xs]
-    gate = at(box(rng.uniform(3, 5), 0.8, 0.2, base=3.2), y=-depth / 2)
+    pilasters = [box(0.5, depth + 0.7, height).moved(x=x) for x in xs]
+    gate = box(rng.uniform(3, 5), 0.8, 0.2, base=3.2).moved(y=-depth / 2)
     return merge([box(length, depth, height + 2.5, base=-2.5), *pilasters, gate])
 
 
@@ -77,23 +76,23 @@ def _roof(rng: np.random.Generator, length: float, depth: float, height: float) 
     vertices = np.concatenate([ridge, np.array(corners)])
     vertices[:, 2] += height
     triangles = np.array([(0, 2, 3), (0, 3, 1), (0, 4, 5), (0, 5, 1), (0, 2, 4), (1, 3, 5)])
-    chimney = at(box(0.6, 0.6, rise + 0.8, base=height), x=length * rng.uniform(-0.35, 0.35), y=0.1 * depth)
+    chimney = box(0.6, 0.6, rise + 0.8, base=height).moved(x=length * rng.uniform(-0.35, 0.35), y=0.1 * depth)
     return merge([Mesh(vertices, triangles), chimney])
 
 
 def _front(rng: np.random.Generator, length: float, depth: float, height: float, floors: int) -> list[Mesh]:
     """The projecting parts of a front: gutters, steps, a porch, a bay window, balconies."""
-    parts = [at(cylinder(0.06, height, 6), x=side * (length / 2 - 0.3), y=-depth / 2 - 0.08) for side in (-1, 1)]
+    parts = [cylinder(0.06, height, 6).moved(x=side * (length / 2 - 0.3), y=-depth / 2 - 0.08) for side in (-1, 1)]
     door = rng.uniform(-0.35, 0.35) * length
-    parts.append(at(box(1.8, 1.0, 0.35), x=door, y=-depth / 2 - 0.5))
+    parts.append(box(1.8, 1.0, 0.35).moved(x=door, y=-depth / 2 - 0.5))
     if rng.random() < 0.5:
-        parts.append(at(box(2.0, 1.2, 0.15, base=2.4), x=door, y=-depth / 2 - 0.6))
+        parts.append(box(2.0, 1.2, 0.15, base=2.4).moved(x=door, y=-depth / 2 - 0.6))
     if rng.random() < 0.5:
         bay_width = rng.uniform(1.6, 3.0)
         bay = box(bay_width, 1.2, min(height, rng.uniform(2.6, 6.0)))
-        parts.append(at(bay, x=-np.sign(door) * rng.uniform(0.15, 0.3) * length, y=-depth / 2 - 0.4))
+        parts.append(bay.moved(x=-np.sign(door) * rng.uniform(0.15, 0.3) * length, y=-depth / 2 - 0.4))
     for floor in range(1, floors):
         if rng.random() < 0.5:
             balcony = box(rng.uniform(2, 4), 1.1, 1.1, base=floor * height / floors - 0.1)
-            parts.append(at(balcony, x=rng.uniform(-0.3, 0.3) * length, y=-depth / 2 - 0.5))
+            parts.append(balcony.moved(x=rng.uniform(-0.3, 0.3) * length, y=-depth / 2 - 0.5))
     return parts

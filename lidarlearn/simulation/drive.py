@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt16
+from jaxtyping import Bool, Float, Float32, UInt16
 
+from lidarlearn.data.pose_files import start_at_identity
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.simulation import motions
 from lidarlearn.simulation.meshes import merge
@@ -68,9 +69,7 @@ class Drive(Sequence):
         self._given_poses = None if poses is None else np.asarray(poses[: frames + 100], dtype=np.float64)
         self._given_world = world if isinstance(world, World) else None
         self.timestamps = torch.arange(self.frames, dtype=torch.float64) * self.sensor.period
-        T_map_lidar = torch.from_numpy(self.trajectory.at(self.timestamps.numpy()))
-        self.T_world_lidar = torch.linalg.inv(T_map_lidar[0]) @ T_map_lidar
-        self.T_world_lidar[0] = torch.eye(4, dtype=torch.float64)
+        self.T_world_lidar = start_at_identity(torch.from_numpy(self.trajectory.at(self.timestamps.numpy())))
 
     def __len__(self) -> int:
         return self.frames
@@ -150,13 +149,10 @@ class Drive(Sequence):
         sensor, period = self.sensor, self.sensor.period
         shares = sensor.column_times() if self.motion_distortion else np.zeros(1)
         T_map_column = self.trajectory.at((index + shares) * period)
-        directions = sensor.directions(index, T_map_column[:, :3, :3])
         rays = np.empty((sensor.beams, sensor.columns, 6), dtype=np.float32)
         rays[..., :3] = T_map_column[:, :3, 3]
-        rays[..., 3:] = directions
-        hits = self._caster.cast(rays.reshape(-1, 6))
-        distances = hits.distances.reshape(rays.shape[:2])
-        cosines = np.abs(np.einsum("bck,bck->bc", hits.normals.reshape(directions.shape), directions))
+        rays[..., 3:] = sensor.directions(index, T_map_column[:, :3, :3])
+        distances, cosines = _first_hits(self._caster, rays)
         if self.world.movers:
             self._cast_movers(index, rays, distances, cosines)
         return distances, cosines
@@ -176,9 +172,7 @@ class Drive(Sequence):
             columns = sector[np.any([_seen(mesh.vertices, pose, azimuths) for mesh in meshes], axis=0)]
             if len(columns):
                 part = np.ascontiguousarray(rays[:, columns])
-                hits = RayCaster(merge(meshes)).cast(part.reshape(-1, 6))
-                found = hits.distances.reshape(part.shape[:2])
-                cosine = np.abs(np.einsum("bck,bck->bc", hits.normals.reshape(*part.shape[:2], 3), part[..., 3:]))
+                found, cosine = _first_hits(RayCaster(merge(meshes)), part)
                 nearer = found < distances[:, columns]
                 distances[:, columns] = np.where(nearer, found, distances[:, columns])
                 cosines[:, columns] = np.where(nearer, cosine, cosines[:, columns])
@@ -187,6 +181,14 @@ class Drive(Sequence):
 def simulator_digest() -> str:
     """Hash of the code on which scans depend: this module and the modules of the simulator that it uses."""
     return source_digest(Path(__file__), within=_SIMULATOR)
+
+
+def _first_hits(
+    caster: RayCaster, rays: Float32[np.ndarray, "beams columns 6"]
+) -> tuple[Float[np.ndarray, "beams columns"], Float[np.ndarray, "beams columns"]]:
+    """Distances [m] to what rays hit, and cosines of the angles of incidence."""
+    hits = caster.cast(rays)
+    return hits.distances, np.abs(np.einsum("bck,bck->bc", hits.normals, rays[..., 3:]))
 
 
 def _arrays(world: World) -> Iterator[np.ndarray]:

@@ -32,7 +32,7 @@ def _rails(site: Site, road: Street, offset: float, share: float) -> None:
     while start < len(line) - 10:
         stop = min(len(line), start + int(site.rng.uniform(40, 160)))
         if site.rng.random() < share:
-            points = np.column_stack([line[start:stop], site.ground(line[start:stop])])
+            points = site.raised(line[start:stop])
             posts = points[:: int(site.rng.choice([2, 4]))]
             site.add_world(merge([ribbon(points, 0.32, 0.45), instances(box(0.12, 0.12, 0.7), posts)]))
         start = stop
@@ -45,7 +45,7 @@ def _barriers(site: Site, road: Street, side: int) -> None:
         length = int(rng.uniform(60, 150))
         start = int(rng.uniform(0, max(1, len(road.centreline) - length)))
         line = road.offset(side * (road.half_width + 3.5))[start : start + length : 4]
-        points = np.column_stack([line, site.ground(line)])
+        points = site.raised(line)
         height = rng.uniform(2.5, 4)
         site.add_world(merge([ribbon(points, height + 0.5, -0.5), instances(box(0.3, 0.3, height + 0.3), points)]))
 
@@ -61,9 +61,9 @@ def _across(site: Site, road: Street) -> None:
         if rng.random() < 0.45:
             span, width, clear = 2 * road.half_width + 16, rng.uniform(6, 12), rng.uniform(5.0, 6.0)
             deck = box(width, span, 1.2, base=clear)
-            parapets = [objects.at(box(0.25, span, 1.0, base=clear + 1.2), x=x) for x in (-width / 2, width / 2)]
-            ends = [objects.at(box(width, 3.0, clear + 1, base=-1.0), y=side * (span / 2 - 1.5)) for side in (-1, 1)]
-            piers = [objects.at(box(1.0, 0.8, clear), x=x) for x in (-width / 3, width / 3)]
+            parapets = [box(0.25, span, 1.0, base=clear + 1.2).moved(x=x) for x in (-width / 2, width / 2)]
+            ends = [box(width, 3.0, clear + 1, base=-1.0).moved(y=side * (span / 2 - 1.5)) for side in (-1, 1)]
+            piers = [box(1.0, 0.8, clear).moved(x=x) for x in (-width / 3, width / 3)]
             site.add(merge([deck, *parapets, *ends, *piers]), road.centreline[k], yaw + rng.uniform(-0.2, 0.2))
         else:
             site.add(objects.gantry(rng, 2 * road.half_width + 5), road.centreline[k], yaw)

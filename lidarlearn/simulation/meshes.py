@@ -19,9 +19,9 @@ class Mesh:
     vertices: Float[np.ndarray, "v 3"]
     triangles: Int[np.ndarray, "t 3"]
 
-    def moved(self, offset: Float[np.ndarray, "3"], yaw: float = 0.0) -> "Mesh":
-        """A copy turned by `yaw` [rad] about z, then shifted by `offset` [m]."""
-        return instances(self, offset[None], np.array([yaw]))
+    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> "Mesh":
+        """A copy turned by `yaw` [rad] about z, then shifted [m]."""
+        return instances(self, np.array([[x, y, z]]), np.array([yaw]))
 
 
 def empty() -> Mesh:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lidarlearn.simulation.meshes import Mesh
+from lidarlearn.simulation.trajectories import arc_length
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Mover:
 
     @cached_property
     def _arc_length(self) -> Float[np.ndarray, "n"]:
-        return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(self.lane, axis=0), axis=1))])
+        return arc_length(self.lane)
 
     def position(self, time: float, ahead: float = 0.0) -> Float[np.ndarray, "3"] | None:
         """Its position at a time [s], or the point `ahead` of it on the lane [m]; None while it is absent."""
@@ -44,7 +45,8 @@ class Mover:
         centre, back, front = (self.position(time, ahead) for ahead in (0.0, -1.0, 1.0))
         if centre is None or back is None or front is None:
             return None
-        return self.mesh.moved(centre, float(np.arctan2(front[1] - back[1], front[0] - back[0])))
+        x, y, z = centre
+        return self.mesh.moved(x, y, z, yaw=np.arctan2(front[1] - back[1], front[0] - back[0]))
 
 
 def snapshot(movers: Sequence[Mover], time: float, centre: Float[np.ndarray, "3"], radius: float) -> list[Mesh]:

@@ -5,11 +5,6 @@ import numpy as np
 from lidarlearn.simulation.meshes import Mesh, box, cylinder, extruded, instances, leaves, merge
 
 
-def at(mesh: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Mesh:
-    """A mesh turned by `yaw` [rad] and shifted [m]."""
-    return mesh.moved(np.array([x, y, z], dtype=float), yaw)
-
-
 def car(rng: np.random.Generator) -> Mesh:
     """A passenger car."""
     length, width, height = rng.uniform(3.8, 4.8), rng.uniform(1.7, 1.9), rng.uniform(1.4, 1.6)
@@ -34,8 +29,8 @@ def van(rng: np.random.Generator) -> Mesh:
 def lorry(rng: np.random.Generator) -> Mesh:
     """A lorry with a box body."""
     length = rng.uniform(8, 14)
-    cab = at(box(2.2, 2.4, 2.6, base=0.5), x=length / 2 - 1.1)
-    body = at(box(length - 2.6, 2.5, 2.8, base=1.0), x=-1.3)
+    cab = box(2.2, 2.4, 2.6, base=0.5).moved(x=length / 2 - 1.1)
+    body = box(length - 2.6, 2.5, 2.8, base=1.0).moved(x=-1.3)
     return merge([cab, body, _wheels(0.5, length, 2.4)])
 
 
@@ -51,22 +46,22 @@ def pedestrian(rng: np.random.Generator) -> Mesh:
     """A person in mid-stride."""
     height = rng.uniform(1.55, 1.9)
     stride = rng.uniform(0.03, 0.2)
-    legs = [at(cylinder(0.09, 0.48 * height, 6), x=sign * stride, y=sign * 0.1) for sign in (-1, 1)]
+    legs = [cylinder(0.09, 0.48 * height, 6).moved(x=sign * stride, y=sign * 0.1) for sign in (-1, 1)]
     torso = cylinder(0.17, 0.38 * height, 6, top_radius=0.24, base=0.46 * height)
     head = cylinder(0.1, 0.14 * height, 6, base=0.86 * height)
     return merge([*legs, torso, head])
 
 
-def tree(rng: np.random.Generator, height: float | None = None) -> Mesh:
+def tree(rng: np.random.Generator) -> Mesh:
     """A broad-leaved tree: a trunk and a porous crown."""
-    height = rng.uniform(5, 12) if height is None else height
+    height = rng.uniform(5, 12)
     radius = 0.025 * height
     trunk = cylinder(radius, 0.6 * height, 7, top_radius=0.6 * radius)
     crowns = []
     for _ in range(3):
         radii = (rng.uniform(0.14, 0.26) * height, rng.uniform(0.14, 0.26) * height, rng.uniform(0.18, 0.3) * height)
         x, y, z = rng.uniform([-0.12, -0.12, 0.55], [0.12, 0.12, 0.75]) * height
-        crowns.append(at(leaves(rng, 130, radii, 0.055 * height), x, y, z))
+        crowns.append(leaves(rng, 130, radii, 0.055 * height).moved(x, y, z))
     return merge([trunk, *crowns])
 
 
@@ -76,14 +71,14 @@ def conifer(rng: np.random.Generator) -> Mesh:
     storeys = []
     for share in np.linspace(0.15, 0.9, 6):
         spread = (1.05 - share) * 0.26 * height
-        storeys.append(at(leaves(rng, 60, (spread, spread, 0.09 * height), 0.05 * height), z=share * height))
+        storeys.append(leaves(rng, 60, (spread, spread, 0.09 * height), 0.05 * height).moved(z=share * height))
     return merge([cylinder(0.02 * height, 0.9 * height, 6, top_radius=0.02), *storeys])
 
 
 def bush(rng: np.random.Generator) -> Mesh:
     """A shrub of one to two metres."""
     radii = (rng.uniform(0.5, 1.3), rng.uniform(0.5, 1.3), rng.uniform(0.5, 1.0))
-    return at(leaves(rng, 150, radii, 0.28), z=0.7 * radii[2])
+    return leaves(rng, 150, radii, 0.28).moved(z=0.7 * radii[2])
 
 
 def hedge(rng: np.random.Generator, length: float) -> Mesh:
@@ -99,26 +94,26 @@ def hedge(rng: np.random.Generator, length: float) -> Mesh:
 def lamp(rng: np.random.Generator) -> Mesh:
     """A street lamp whose arm reaches out along x."""
     height = rng.uniform(5, 8)
-    return merge([cylinder(0.09, height, 6, top_radius=0.05), at(box(1.6, 0.15, 0.1, base=height), x=0.8)])
+    return merge([cylinder(0.09, height, 6, top_radius=0.05), box(1.6, 0.15, 0.1, base=height).moved(x=0.8)])
 
 
 def sign(rng: np.random.Generator) -> Mesh:
     """A traffic sign whose board faces x."""
     size, height = rng.uniform(0.5, 0.9), rng.uniform(2.0, 2.5)
-    return merge([cylinder(0.04, height + size, 5), at(box(0.03, size, size, base=height), x=0.06)])
+    return merge([cylinder(0.04, height + size, 5), box(0.03, size, size, base=height).moved(x=0.06)])
 
 
 def road_sign(rng: np.random.Generator) -> Mesh:
     """A large motorway sign on two posts whose board faces x."""
     width, height = rng.uniform(2.5, 5), rng.uniform(1.5, 3)
-    posts = [at(cylinder(0.08, 2.0 + height, 6), y=side * width / 3) for side in (-1, 1)]
-    return merge([*posts, at(box(0.06, width, height, base=2.0), x=0.1)])
+    posts = [cylinder(0.08, 2.0 + height, 6).moved(y=side * width / 3) for side in (-1, 1)]
+    return merge([*posts, box(0.06, width, height, base=2.0).moved(x=0.1)])
 
 
 def gantry(rng: np.random.Generator, span: float) -> Mesh:
     """A sign gantry over a carriageway along x, `span` metres wide."""
-    posts = [at(box(0.4, 0.4, 6.5), y=side * span / 2) for side in (-1, 1)]
-    boards = [at(box(0.15, 3.5, 2.2, base=5.4), y=y) for y in (-0.22 * span, 0.22 * span)]
+    posts = [box(0.4, 0.4, 6.5).moved(y=side * span / 2) for side in (-1, 1)]
+    boards = [box(0.15, 3.5, 2.2, base=5.4).moved(y=y) for y in (-0.22 * span, 0.22 * span)]
     return merge([*posts, box(0.5, span, 0.6, base=6.2), *boards])
 
 
@@ -135,14 +130,14 @@ def bin_or_box(rng: np.random.Generator) -> Mesh:
 def bench(rng: np.random.Generator) -> Mesh:
     """A park bench facing x."""
     length = rng.uniform(1.5, 2.2)
-    legs = [at(box(0.4, 0.08, 0.42), y=side * 0.42 * length) for side in (-1, 1)]
-    return merge([*legs, box(0.45, length, 0.06, base=0.42), at(box(0.06, length, 0.4, base=0.5), x=-0.22)])
+    legs = [box(0.4, 0.08, 0.42).moved(y=side * 0.42 * length) for side in (-1, 1)]
+    return merge([*legs, box(0.45, length, 0.06, base=0.42), box(0.06, length, 0.4, base=0.5).moved(x=-0.22)])
 
 
 def wall(rng: np.random.Generator, length: float) -> Mesh:
     """A garden wall along x, with pillars."""
     height = rng.uniform(0.8, 2.2)
-    pillars = [at(box(0.4, 0.45, height + 0.2), x=x) for x in np.arange(-length / 2, length / 2 + 0.1, 3.0)]
+    pillars = [box(0.4, 0.45, height + 0.2).moved(x=x) for x in np.arange(-length / 2, length / 2 + 0.1, 3.0)]
     return merge([box(length, 0.25, height), *pillars])
 
 

@@ -20,8 +20,8 @@ class Hits:
         normals: unit normal of the surface, of either sign; zero if the ray hits nothing.
     """
 
-    distances: Float[np.ndarray, "n"]
-    normals: Float[np.ndarray, "n 3"]
+    distances: Float[np.ndarray, "*batch"]
+    normals: Float[np.ndarray, "*batch 3"]
 
 
 class RayCaster:
@@ -39,8 +39,8 @@ class RayCaster:
         triangles = np.ascontiguousarray(mesh.triangles, dtype=np.uint32)
         self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
 
-    def cast(self, rays: Float32[np.ndarray, "n 6"]) -> Hits:
-        """Find the first surface on each ray, which is given by its origin and direction."""
+    def cast(self, rays: Float32[np.ndarray, "*batch 6"]) -> Hits:
+        """Find the first surface on each ray, which is given by its origin and direction; `rays` is contiguous."""
         answer = self._scene.cast_rays(self._tensor.from_numpy(rays))
         return Hits(answer["t_hit"].numpy(), answer["primitive_normals"].numpy())
 

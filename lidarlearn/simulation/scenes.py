@@ -29,16 +29,16 @@ def straight_path(frames: int, step: float, start: float = 0.0, yaw_step: float 
 def room(length: float = 20.0, width: float = 14.0, height: float = 4.0) -> World:
     """A closed room around the origin with a few boxes in it, which constrains motion in every direction."""
     furniture = [
-        objects.at(box(2.0, 1.0, 1.2), 5.0, 3.0, 0.0, 0.4),
-        objects.at(box(1.0, 3.0, 2.0), -6.0, -4.0, 0.0, -0.3),
-        objects.at(box(0.5, 0.5, height), 3.0, -3.5, 0.0, 0.8),
+        box(2.0, 1.0, 1.2).moved(5.0, 3.0, 0.0, 0.4),
+        box(1.0, 3.0, 2.0).moved(-6.0, -4.0, 0.0, -0.3),
+        box(0.5, 0.5, height).moved(3.0, -3.5, 0.0, 0.8),
     ]
     return World(merge([box(length, width, height), *furniture]))
 
 
 def corridor(width: float = 8.0, height: float = 6.0, length: float = 1000.0) -> World:
     """An endless floor and two endless plane walls, which do not constrain motion along x."""
-    walls = [objects.at(box(length, 0.2, height), y=side * (width / 2 + 0.1)) for side in (-1, 1)]
+    walls = [box(length, 0.2, height).moved(y=side * (width / 2 + 0.1)) for side in (-1, 1)]
     return World(merge([box(length, 4 * width, 1.0, base=-1.0), *walls]))
 
 
@@ -53,17 +53,15 @@ def tunnel(radius: float = 5.0, length: float = 1000.0) -> World:
 def street(seed: int = 0, length: float = 200.0) -> World:
     """A straight street on a plane, from x = -50 on, with houses, trees, lamps and parked cars."""
     rng = np.random.default_rng(seed)
-    parts: list[Mesh] = [objects.at(box(length + 200, 200.0, 1.0, base=-1.0), x=length / 2 - 50)]
+    parts: list[Mesh] = [box(length + 200, 200.0, 1.0, base=-1.0).moved(x=length / 2 - 50)]
     for side in (-1, 1):
         x = -50.0
         while x < length - 50:
             size = rng.uniform(9, 18)
             front = 0.0 if side > 0 else np.pi
-            parts.append(
-                objects.at(building(rng, size, 9.0, rng.uniform(4, 10)), x + size / 2, side * 14.5, 0.0, front)
-            )
-            parts.append(objects.at(objects.tree(rng), x + rng.uniform(0, size), side * 6.5))
-            parts.append(objects.at(objects.lamp(rng), x + rng.uniform(0, size), side * 5.5, 0.0, -side * np.pi / 2))
-            parts.append(objects.at(objects.car(rng), x + rng.uniform(0, size), side * 4.5))
+            parts.append(building(rng, size, 9.0, rng.uniform(4, 10)).moved(x + size / 2, side * 14.5, 0.0, front))
+            parts.append(objects.tree(rng).moved(x + rng.uniform(0, size), side * 6.5))
+            parts.append(objects.lamp(rng).moved(x + rng.uniform(0, size), side * 5.5, 0.0, -side * np.pi / 2))
+            parts.append(objects.car(rng).moved(x + rng.uniform(0, size), side * 4.5))
             x += size + rng.uniform(0, 6)
     return World(merge(parts))

@@ -76,6 +76,7 @@ class Site:
     """
 
     _CELL = 0.5  # edge of a cell of the grid of occupied ground [m]
+    _FINE_WIDTH = 7.0  # distance from the edge of a street up to which the mesh of the ground is fine [m]
 
     def __init__(self, rng: np.random.Generator, terrain: Terrain, streets: list[Street], profile: Profile) -> None:
         self.rng, self.terrain, self.streets, self.profile = rng, terrain, streets, profile
@@ -97,18 +98,15 @@ class Site:
         """Height of the ground including kerbs and banks [m]."""
         return self.terrain.height(xy) + self._relief(xy, self.beside(xy))
 
+    def raised(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+        """The points, raised to the height of the ground."""
+        return np.column_stack([xy, self.ground(xy)])
+
     def _relief(self, xy: Float[np.ndarray, "n 2"], beside: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         kerb = self.profile.kerb * np.clip(beside / 0.3, 0, 1)
         rise = np.clip((beside - self.profile.bank_start) / 12.0, 0, 1)
         wave = np.sin(xy @ (np.array([[0.021, 0.013], [-0.017, 0.024]])) + self._banks[0, :2]).sum(axis=-1)
         return kerb + self.profile.bank * rise * rise * (3 - 2 * rise) * (0.35 + wave)
-
-    def ground_mesh(self, cell: float = 0.6, coarse: float = 5.0, width: float = 7.0) -> Mesh:
-        """The ground: fine on the streets and up to `width` beside them, because of the kerbs; coarse elsewhere."""
-        fine = self._surface(cell, -np.inf, width, 0.0)
-        # Coarse triangles continue below the fine ones, so that no ray passes between them.
-        rest = self._surface(coarse, width - 1.5 * coarse, np.inf, 0.08)
-        return merge([fine, rest])
 
     def _surface(self, cell: float, nearest: float, farthest: float, sunk: float) -> Mesh:
         """The ground within a range of distances from the edge of a street, lowered by `sunk` near the streets."""
@@ -124,7 +122,7 @@ class Site:
         )
         z = np.zeros(inside.shape)
         z[inside] = self.terrain.height(xy[inside]) + self._relief(xy[inside], beside[inside]) + rough
-        z[inside] -= sunk * (beside[inside] < 7.0)
+        z[inside] -= sunk * (beside[inside] < self._FINE_WIDTH)
         return sheet(np.concatenate([xy, z[..., None]], axis=-1), keep)
 
     def spots(self, street: Street, side: int, beside: float, spacing: tuple[float, float]) -> Iterator[Spot]:
@@ -164,7 +162,7 @@ class Site:
 
     def add(self, mesh: Mesh, xy: Float[np.ndarray, "2"], yaw: float) -> None:
         """Build an object whether or not the ground is free."""
-        self._meshes.append(mesh.moved(np.array([*xy, self.ground(xy[None])[0]]), yaw))
+        self._meshes.append(mesh.moved(xy[0], xy[1], self.ground(xy[None])[0], yaw))
 
     def add_world(self, mesh: Mesh) -> None:
         """Build an object whose vertices are in the world frame."""
@@ -179,9 +177,8 @@ class Site:
         free = (self.beside(xy) > clearance) & ~self._occupied[cells[:, 0], cells[:, 1]]
         xy, scales = xy[free], scales[free]
         if len(xy):
-            positions = np.column_stack([xy, self.ground(xy)])
             yaws = self.rng.uniform(0, 2 * np.pi, len(xy))
-            self._meshes.append(instances(mesh, positions, yaws, np.repeat(scales[:, None], 3, axis=1)))
+            self._meshes.append(instances(mesh, self.raised(xy), yaws, np.repeat(scales[:, None], 3, axis=1)))
 
     def _footprint(self, xy: np.ndarray, yaw: float, size: tuple[float, float]) -> np.ndarray | None:
         """Grid cells below a rotated rectangle; None if it is not entirely on the site."""
@@ -193,5 +190,8 @@ class Site:
         return None if outside else cells
 
     def mesh(self) -> Mesh:
-        """Everything built, and the ground."""
-        return merge([*self._meshes, self.ground_mesh()])
+        """Everything built, and the ground: fine on and near the streets, because of the kerbs; coarse elsewhere."""
+        fine = self._surface(0.6, -np.inf, self._FINE_WIDTH, sunk=0.0)
+        # Coarse triangles continue below the fine ones, so that no ray passes between them.
+        rest = self._surface(5.0, self._FINE_WIDTH - 1.5 * 5.0, np.inf, sunk=0.08)
+        return merge([*self._meshes, fine, rest])

@@ -129,10 +129,14 @@ def read_poses(path: Path, camera: bool) -> Float[np.ndarray, "n 4 4"]:
     return poses
 
 
+def arc_length(path: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
+    """Length of the path up to each of its points [m]."""
+    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+
+
 def extended(path: Float[np.ndarray, "n d"], length: float) -> Float[np.ndarray, "m d"]:
     """A path resampled at 1 m and extended straight ahead by `length` [m] at either end."""
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    s = np.concatenate([[0], np.cumsum(steps)])
+    s = arc_length(path)
     grid = np.arange(0, max(s[-1], 1.0), 1.0)
     thinned = np.column_stack([np.interp(grid, s, path[:, k]) for k in range(path.shape[1])])
     if len(thinned) < 3 or s[-1] < 3:

@@ -15,7 +15,7 @@ from lidarlearn.simulation.movers import Mover
 from lidarlearn.simulation.sensors import Sensor, hdl32_inverted, hdl64
 from lidarlearn.simulation.site import Profile, Site, Street
 from lidarlearn.simulation.terrain import Terrain
-from lidarlearn.simulation.trajectories import Vehicle
+from lidarlearn.simulation.trajectories import Vehicle, arc_length
 from lidarlearn.simulation.urban import furnish_campus, furnish_town
 
 
@@ -193,27 +193,26 @@ def _movers(
 ) -> list[Mover]:
     rng, main = site.rng, site.streets[0]
     times, positions = ego
-    step = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    driven = np.concatenate([[0], np.cumsum(step)])
+    driven = arc_length(positions)
     begin = float(np.argmin(np.linalg.norm(track - positions[0], axis=1)))
     movers = []
     if place.driving is not None:
         for gap in (rng.uniform(14, 35), rng.uniform(45, 80), -rng.uniform(12, 30)):
             if rng.random() < 0.7:
                 drift = np.clip(rng.normal(scale=0.02) * driven, -8, 8)
-                movers.append(Mover(_vehicle(rng), _raised(site, track), times, begin + driven + gap + drift))
+                movers.append(Mover(_vehicle(rng), site.raised(track), times, begin + driven + gap + drift))
     lanes = [(main.offset(place.lane)[::-1], place.oncoming)]
     if main.half_width > 8:  # a wide road has a second lane in either direction
         lanes += [(main.offset(1.9)[::-1], place.oncoming), (main.offset(-1.9), place.oncoming)]
     for lane, spacing in lanes:
-        line = _raised(site, lane)
+        line = site.raised(lane)
         speed, start = rng.uniform(*place.traffic), rng.uniform(0, spacing[0]) - 900.0
         while start < len(line):
             movers.append(Mover(_vehicle(rng), line, times, start + speed * (times - times[0])))
             start += rng.uniform(*spacing)
     for _ in range(place.pedestrians):
         side = rng.choice([-1, 1])
-        line = _raised(site, main.offset(side * (main.half_width + rng.uniform(0.8, 1.9)))[:: rng.choice([-1, 1])])
+        line = site.raised(main.offset(side * (main.half_width + rng.uniform(0.8, 1.9)))[:: rng.choice([-1, 1])])
         travelled = rng.uniform(0, len(line)) + rng.uniform(0.8, 1.7) * (times - times[0])
         movers.append(Mover(objects.pedestrian(rng), line, times, travelled))
     return movers
@@ -222,8 +221,3 @@ def _movers(
 def _vehicle(rng: np.random.Generator) -> Mesh:
     kind = int(rng.choice(3, p=[0.78, 0.12, 0.1]))
     return (objects.car, objects.van, objects.lorry)[kind](rng)
-
-
-def _raised(site: Site, line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """The line, raised to the height of the ground."""
-    return np.column_stack([line, site.ground(line)])

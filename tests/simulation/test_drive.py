@@ -123,7 +123,7 @@ def test_movers_hide_what_is_behind_them(urban):
 )
 def test_what_could_move_looks_like_what_stands_there(body, y, yaw, distorted):
     """Sides of lorries are two triangles: between their vertices, too; and from within."""
-    turned = body.moved(np.zeros(3), yaw)
+    turned = body.moved(yaw=yaw)
     lane = np.stack([np.linspace(-50, 50, 101), np.full(101, y), np.zeros(101)], axis=1)
     mover = Mover(turned, lane, np.array([-1.0, 100.0]), np.array([50.0, 50.0]))
     floor, poses = box(400.0, 400.0, 1.0, base=-1.0), scenes.straight_path(5, 1.5, start=-3.0, yaw_step=0.1)
@@ -209,7 +209,7 @@ def test_the_fingerprint_knows_all_of_a_world_of_ones_own():
     ground, lane, times = box(80.0, 80.0, 0.1, base=-1.8), np.array([[5.0, -30, -1.7], [5, 30, -1.7]]), np.arange(3.0)
     bus = Mover(box(3.0, 3.0, 3.0), lane, times, 30 + times)
     worlds = [World(ground), World(replace(ground, triangles=ground.triangles[:6])), World(ground, (bus,))]
-    changes = ({"mesh": box(3.0, 3.0, 2.0)}, {"lane": lane + 1}, {"times": times + 1}, {"way": times})
+    changes = ({"mesh": box(3.0, 3.0, 2.0)}, {"lane": lane + 1}, {"times": times + 1}, {"travelled": times})
     worlds += [World(ground, (replace(bus, **change),)) for change in changes]
     poses = np.tile(np.eye(4), (4, 1, 1))
     fingerprints = [Drive(world, poses=poses, sensor=SENSOR).fingerprint for world in worlds]

@@ -25,13 +25,13 @@ def test_extruded_square_is_a_box():
 
 
 def test_moved_turns_about_z_then_shifts():
-    mesh = box(2.0, 1.0, 1.0).moved(np.array([10.0, 0, 0]), np.pi / 2)
+    mesh = box(2.0, 1.0, 1.0).moved(x=10.0, yaw=np.pi / 2)
     assert np.ptp(mesh.vertices, axis=0) == pytest.approx([1.0, 2.0, 1.0])
     assert mesh.vertices.mean(axis=0) == pytest.approx([10.0, 0, 0.5])
 
 
 def test_merge_keeps_every_triangle_in_place():
-    a, b = box(1.0, 1.0, 1.0), box(1.0, 1.0, 1.0).moved(np.array([5.0, 0, 0]))
+    a, b = box(1.0, 1.0, 1.0), box(1.0, 1.0, 1.0).moved(x=5.0)
     merged = merge([a, empty(), b])
     assert _volume(merged) == pytest.approx(2.0)
     assert np.array_equal(merged.vertices[merged.triangles[12:]], b.vertices[b.triangles])
