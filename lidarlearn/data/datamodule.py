@@ -59,6 +59,7 @@ class OdometryDataModule(LightningDataModule):
         if resident not in (True, False, "auto"):
             raise ValueError(f"resident is true, false or auto, got {resident!r}")
         self.data = data
+        self._names = dict.fromkeys((*data.train_sequences, *data.val_sequences))  # each once, in order
         self.batch_size = batch_size
         self.num_workers = num_workers
         self.cache_root = Path(cache_root).expanduser()
@@ -81,7 +82,7 @@ class OdometryDataModule(LightningDataModule):
         """
         self.data.prepare()
         # All are opened first: errors show before minutes of projecting.
-        sequences = self.data.sequences(dict.fromkeys([*self.data.train_sequences, *self.data.val_sequences]))
+        sequences = self.data.sequences(self._names)
         if self.trainer is not None and getattr(self.trainer.lightning_module, "needs_ground_truth", False):
             _require_ground_truth(sequences)
         cache.require_room(sequences.values(), self.projection, self.cache_root)
@@ -90,8 +91,7 @@ class OdometryDataModule(LightningDataModule):
 
     def setup(self, stage: str | None = None) -> None:
         """Open the sequences and their caches; called in every process."""
-        names = dict.fromkeys([*self.data.train_sequences, *self.data.val_sequences])
-        sequences = {name: self.data.sequence(name) for name in names}
+        sequences = {name: self.data.sequence(name) for name in self._names}
         self._maps = cache.VertexMaps(*(file for s in sequences.values() for file in self._vertex_maps(s).files))
         ends = accumulate(map(len, sequences.values()))
         rows = {name: range(end - len(sequences[name]), end) for name, end in zip(sequences, ends, strict=True)}

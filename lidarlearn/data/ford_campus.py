@@ -124,8 +124,7 @@ class FordCampus(DataSetOnDisk):
         self, name: str, scans: ScanFiles, read: Callable[[str, ScanFiles], NDArray[np.float64]]
     ) -> FordCampusSequence:
         layout.refuse_deskew(self.title, self.deskew)
-        if not len(scans):
-            raise self.not_found(name, f"{name}/SCANS/Scan*.mat{scans.misnamed}")
+        self.require_scans(name, scans, "Scan*.mat")
         warn_of_gaps(name, scans)
         stamped = read(name, scans)
         T_world_vehicle = _from_degrees(np.concatenate([stamped[:, 1:4], np.degrees(stamped[:, 4:])], axis=1))

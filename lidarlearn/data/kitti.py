@@ -91,12 +91,10 @@ class KittiOdometry(DataSetOnDisk):
         layout.refuse_deskew(self.title, self.deskew)
         folder = self.root / "sequences" / name
         scans = self._scans(name).first(self.max_frames)
-        if not len(scans):
-            raise self.not_found(name, f"sequences/{name}/velodyne/*.bin{scans.misnamed}")
-        if not (folder / "calib.txt").is_file():
-            raise self.not_found(name, f"sequences/{name}/calib.txt")
+        self.require_scans(name, scans, "*.bin")
+        calibration = self.require_file(name, folder / "calib.txt")
         warn_of_gaps(name, scans)
-        T_camera_lidar = read_labelled_transform(folder / "calib.txt", "Tr:")
+        T_camera_lidar = read_labelled_transform(calibration, "Tr:")
         return KittiOdometrySequence(
             name=name,
             scans=scans,
@@ -153,6 +151,5 @@ class KittiOdometry(DataSetOnDisk):
 
 
 def _require_rows(path: Path, rows: int, scans: ScanFiles) -> None:
-    if rows <= max(scans.numbers):
-        last = scans.names[max(range(len(scans)), key=scans.numbers.__getitem__)]
-        raise DamagedFileError(path, f"{rows} rows, too few for scan {last} in {scans.folder}")
+    if rows <= scans.numbers[-1]:
+        raise DamagedFileError(path, f"{rows} rows, too few for scan {scans.names[-1]} in {scans.folder}")

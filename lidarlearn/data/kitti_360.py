@@ -16,11 +16,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data import layout
-from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.interpolation import covered, interpolate_poses
-from lidarlearn.data.kitti_raw import sweep_times
-from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
+from lidarlearn.data.interpolation import covered
+from lidarlearn.data.kitti_raw import KittiRawSequence
+from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.oxts import read_timestamps
 from lidarlearn.data.pose_files import (
     StampedPoses,
@@ -28,17 +27,16 @@ from lidarlearn.data.pose_files import (
     read_labelled_transform,
     read_numbers,
     require_finite,
-    start_at_identity,
 )
-from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, read_float32_rows, subfolders
-from lidarlearn.data.sequence import LayoutReport, Names, Scan
+from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders
+from lidarlearn.data.sequence import LayoutReport, Names
 from lidarlearn.geometry.projection import SphericalProjection
 
 _PREFIX, _SUFFIX = "2013_05_28_drive_", "_sync"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Kitti360Sequence(SequenceOnDisk):
+class Kitti360Sequence(KittiRawSequence):
     """A drive of KITTI-360.
 
     Args:
@@ -48,12 +46,6 @@ class Kitti360Sequence(SequenceOnDisk):
         timestamps: when the laser faced forward [s], of the day's clock.
         beam_correction_deg: angle by which every beam is raised.
     """
-
-    def scan(self, index: int) -> Scan:
-        """Read one scan, with point times relative to the middle of the sweep."""
-        rows = read_float32_rows(self.scans.path(index), columns=4)
-        points = raise_beams(rows[:, :3], self.beam_correction_deg)
-        return Scan(points, times=sweep_times(points), intensities=rows[:, 3].clamp(0, 1))
 
 
 class Kitti360(DataSetOnDisk):
@@ -93,11 +85,8 @@ class Kitti360(DataSetOnDisk):
     def sequence(self, name: str) -> Kitti360Sequence:
         """Open a drive; scans before its first and after its last pose are left out."""
         scans = self._scans(name)
-        if not len(scans):
-            raise self.not_found(name, f"data_3d_raw/{drive_folder(name)}/velodyne_points/data/*.bin{scans.misnamed}")
-        stamps = self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "timestamps.txt"
-        if not stamps.is_file():
-            raise self.not_found(name, str(stamps.relative_to(self.root)))
+        self.require_scans(name, scans, "*.bin")
+        stamps = self.require_file(name, scans.folder.parent / "timestamps.txt")
         truth = self._poses(name, stamps)
         if truth is not None:
             times = read_timestamps(stamps, scans.numbers)
@@ -106,15 +95,10 @@ class Kitti360(DataSetOnDisk):
         if not len(scans):
             raise DamagedFileError(self._poses_file(name), f"its poses belong to none of the scans of {name}")
         timestamps = read_timestamps(stamps, scans.numbers)
-        T_world_lidar = None
-        if truth is not None:
-            T_world_lidar = start_at_identity(
-                interpolate_poses(truth.timestamps, truth.T_world_body, timestamps) @ self._calibration(name)
-            )
         return Kitti360Sequence(
             name=name,
             scans=scans,
-            T_world_lidar=T_world_lidar,
+            T_world_lidar=None if truth is None else truth.of_lidar(self._calibration(name), timestamps),
             timestamps=timestamps,
             beam_correction_deg=self.beam_correction_deg,
         )
@@ -169,10 +153,8 @@ class Kitti360(DataSetOnDisk):
 
     def _calibration(self, name: str) -> Float[Tensor, "4 4"]:
         """T_imu_lidar."""
-        paths = [self.root / "calibration" / file for file in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt")]
-        for path in paths:
-            if not path.is_file():
-                raise self.not_found(name, str(path.relative_to(self.root)))
+        files = ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt")
+        paths = [self.require_file(name, self.root / "calibration" / file) for file in files]
         T_imu_camera = read_labelled_transform(paths[0], "image_00:")
         T_lidar_camera = read_labelled_transform(paths[1], "")
         return T_imu_camera @ torch.linalg.inv(T_lidar_camera)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
-from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
+from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.oxts import read_oxts_poses, read_rigid_transform, read_timestamps
@@ -135,8 +135,7 @@ class KittiRaw(DataSetOnDisk):
         """Open the first `count` scans of a drive that its packets cover; None opens all."""
         folder = self._folder(name)
         scans = self._scans(name)
-        if not len(scans):
-            raise self._lacking(name, folder / "velodyne_points" / "data" / f"*.bin{scans.misnamed}")
+        self.require_scans(name, scans, "*.bin")
         packets = _packets(folder)
         packet_times = self._packet_times(name, packets) if len(packets) else None
         if packet_times is not None:
@@ -204,17 +203,13 @@ class KittiRaw(DataSetOnDisk):
         return scans.select(i for i, number in enumerate(scans.numbers) if drive.first <= number <= last)
 
     def _timestamps(self, name: str, scans: ScanFiles) -> Float[Tensor, "n"]:
-        paths = [self._folder(name) / "velodyne_points" / f"timestamps_{end}.txt" for end in ("start", "end")]
-        for path in paths:
-            if not path.is_file():
-                raise self._lacking(name, path)
+        files = (scans.folder.parent / f"timestamps_{end}.txt" for end in ("start", "end"))
+        paths = [self.require_file(name, file) for file in files]
         start, end = (read_timestamps(path, scans.numbers) for path in paths)
         return (start + end) / 2
 
     def _packet_times(self, name: str, packets: ScanFiles) -> Float[Tensor, "n"]:
-        path = self._folder(name) / "oxts" / "timestamps.txt"
-        if not path.is_file():
-            raise self._lacking(name, path)
+        path = self.require_file(name, self._folder(name) / "oxts" / "timestamps.txt")
         times = read_timestamps(path, packets.numbers)
         if len(times) < 2 or (times.diff() <= 0).any():
             raise DamagedFileError(path, "fewer than two times, or times that do not ascend")
@@ -223,19 +218,13 @@ class KittiRaw(DataSetOnDisk):
     def _poses(
         self, name: str, packets: ScanFiles, packet_times: Float[Tensor, "n"], timestamps: Float[Tensor, "m"]
     ) -> Float[Tensor, "m 4 4"]:
-        calibration = self._folder(name).parent / "calib_imu_to_velo.txt"
-        if not calibration.is_file():
-            raise self._lacking(name, calibration)
-        T_lidar_imu = read_rigid_transform(calibration)
+        T_lidar_imu = read_rigid_transform(self.require_file(name, self._folder(name).parent / "calib_imu_to_velo.txt"))
         # Only the packets that the scans need: a drive has thousands, one file each.
         first = max(int((packet_times <= timestamps.min()).sum()) - 1, 0)
         end = int((packet_times < timestamps.max()).sum()) + 1
         used = range(len(packets))[min(first, len(packets) - 2) : max(first + 2, end)]
         T_world_lidar = read_oxts_poses(packets.select(used)) @ torch.linalg.inv(T_lidar_imu)
         return start_at_identity(interpolate_poses(packet_times[list(used)], T_world_lidar, timestamps))
-
-    def _lacking(self, name: str, path: Path) -> DataSetNotFoundError:
-        return self.not_found(name, str(path.relative_to(self.root)))
 
 
 def sweep_times(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:

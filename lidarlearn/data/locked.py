@@ -1,15 +1,13 @@
 """A file lock between processes."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 
-@contextmanager
-def locked(file: Path, waiting: str) -> Iterator[None]:
-    """Hold a lock; print a message if another process holds it.
+def locked(file: Path, waiting: str) -> AbstractContextManager[object]:
+    """Take a lock, to be held in a `with` block; prints a message if another process holds it.
 
     Args:
         file: of the lock; created if missing.
@@ -17,11 +15,7 @@ def locked(file: Path, waiting: str) -> Iterator[None]:
     """
     lock = FileLock(file)
     try:
-        lock.acquire(timeout=0)
+        return lock.acquire(timeout=0)
     except Timeout:
         print(waiting, flush=True)
-        lock.acquire()
-    try:
-        yield
-    finally:
-        lock.release()
+        return lock.acquire()

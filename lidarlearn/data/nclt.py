@@ -21,9 +21,9 @@ from torch import Tensor
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.interpolation import covered, interpolate_poses
+from lidarlearn.data.interpolation import covered
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
-from lidarlearn.data.pose_files import StampedPoses, read_numbers, start_at_identity, transforms_from_euler
+from lidarlearn.data.pose_files import StampedPoses, read_numbers, transforms_from_euler
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, read_bytes, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
@@ -101,8 +101,7 @@ class Nclt(DataSetOnDisk):
         """Open a drive; scans before and after its ground truth are left out."""
         layout.refuse_deskew(self.title, self.deskew)
         scans = self._scans(name)
-        if not len(scans):
-            raise self.not_found(name, f"{name}/velodyne_sync/*.bin{scans.misnamed}")
+        self.require_scans(name, scans, "*.bin")
         ground_truth = self._ground_truth_file(name)
         truth = None if ground_truth is None else read_ground_truth(ground_truth)
         if truth is not None:
@@ -114,7 +113,7 @@ class Nclt(DataSetOnDisk):
         return NcltSequence(
             name=name,
             scans=scans,
-            T_world_lidar=None if truth is None else self._poses(truth, timestamps),
+            T_world_lidar=None if truth is None else truth.of_lidar(self.T_files_lidar, timestamps),
             timestamps=timestamps,
             beam_correction_deg=self.beam_correction_deg,
             sensor_height_m=self.sensor_height_m,
@@ -151,10 +150,6 @@ class Nclt(DataSetOnDisk):
     def _ground_truth_file(self, name: str) -> Path | None:
         candidates = (folder / f"groundtruth_{name}.csv" for folder in (self.root / name, self.root / "ground_truth"))
         return next((path for path in candidates if path.is_file()), None)
-
-    def _poses(self, truth: StampedPoses, timestamps: Float[Tensor, "n"]) -> Float[Tensor, "n 4 4"]:
-        T_world_files = interpolate_poses(truth.timestamps, truth.T_world_body, timestamps)
-        return start_at_identity(T_world_files @ self.T_files_lidar)
 
 
 def read_ground_truth(path: Path) -> StampedPoses:

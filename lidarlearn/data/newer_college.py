@@ -19,9 +19,9 @@ from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.cloud_files import note_returns, read_cloud
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.interpolation import covered, interpolate_poses
+from lidarlearn.data.interpolation import covered
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
-from lidarlearn.data.pose_files import StampedPoses, read_numbers, stamped_poses, start_at_identity
+from lidarlearn.data.pose_files import StampedPoses, read_numbers, stamped_poses
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders
 from lidarlearn.data.sequence import LayoutReport, Names, Scan
 from lidarlearn.geometry import se3
@@ -100,8 +100,7 @@ class NewerCollege(DataSetOnDisk):
     def sequence(self, name: str) -> NewerCollegeSequence:
         """Open a walk; scans before and after its ground truth are left out."""
         scans = _scans(self.root / name)
-        if not len(scans):
-            raise self.not_found(name, f"{name}/raw_format/ouster_scan/cloud_*.pcd{scans.misnamed}")
+        self.require_scans(name, scans, "cloud_*.pcd")
         truth_file = self._truth_file(name)
         truth = read_registered_poses(truth_file) if truth_file.is_file() else None
         if truth is not None:
@@ -110,14 +109,10 @@ class NewerCollege(DataSetOnDisk):
         if not len(scans):
             raise DamagedFileError(truth_file, f"its times do not overlap with those of the scans of {name}")
         timestamps = _middles(scans)
-        T_world_lidar = None
-        if truth is not None:
-            T_world_camera = interpolate_poses(truth.timestamps, truth.T_world_body, timestamps)
-            T_world_lidar = start_at_identity(T_world_camera @ T_CAMERA_LIDAR)
         return NewerCollegeSequence(
             name=name,
             scans=scans,
-            T_world_lidar=T_world_lidar,
+            T_world_lidar=None if truth is None else truth.of_lidar(T_CAMERA_LIDAR, timestamps),
             timestamps=timestamps,
             beam_correction_deg=self.beam_correction_deg,
         )

@@ -105,6 +105,21 @@ class DataSetOnDisk(DataSet):
             remedy = ROOT_REMEDY
         return DataSetNotFoundError(self.title, missing, self.root, self.source, remedy)
 
+    def require_scans(self, name: str, scans: ScanFiles, pattern: str) -> None:
+        """Raise DataSetNotFoundError if a sequence has no scans; `pattern` of their names is for the message."""
+        if not len(scans):
+            raise self.not_found(name, f"{scans.folder.relative_to(self.root)}/{pattern}{scans.misnamed}")
+
+    def require_file(self, name: str, path: Path) -> Path:
+        """The path of a file that a sequence needs.
+
+        Raises:
+            DataSetNotFoundError: there is no such file.
+        """
+        if not path.is_file():
+            raise self.not_found(name, str(path.relative_to(self.root)))
+        return path
+
     def _whole(self) -> dict[str, ScanFiles]:
         """The existing sequences with at least one scan."""
         return {name: scans for name, scans in self.found().items() if len(scans)}

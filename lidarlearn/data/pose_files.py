@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.interpolation import interpolate_poses
 from lidarlearn.geometry import se3
 
 
@@ -25,6 +26,10 @@ class StampedPoses:
 
     timestamps: Float[Tensor, "n"]
     T_world_body: Float[Tensor, "n 4 4"]
+
+    def of_lidar(self, T_body_lidar: Float[Tensor, "4 4"], timestamps: Float[Tensor, "m"]) -> Float[Tensor, "m 4 4"]:
+        """Poses of a LiDAR on the body, interpolated at other times [s]; the first one is the identity."""
+        return start_at_identity(interpolate_poses(self.timestamps, self.T_world_body, timestamps) @ T_body_lidar)
 
 
 def read_lines(path: Path) -> list[str]:
