@@ -6,6 +6,7 @@
 import sys
 from pathlib import Path
 
+from matplotlib.ticker import MaxNLocator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from lidarlearn.evaluation.plots import Panel, curves_figure, write_plots
@@ -23,7 +24,10 @@ def main(runs: list[Path]) -> None:
     panels = [
         Panel("epoch", what, {name: curve(e, tag) for name, e in events.items()}) for what, tag in _PANELS.items()
     ]
-    write_plots(_IMAGES, [("training_curves", curves_figure("validation drives", panels))])
+    figure = curves_figure("validation drives", panels)
+    for axes in figure.axes:
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    write_plots(_IMAGES, [("training_curves", figure)])
 
 
 def curve(events: EventAccumulator, tag: str) -> dict[float, float]:

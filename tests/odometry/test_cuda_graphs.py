@@ -41,7 +41,7 @@ def test_a_drive_is_the_same(association, map_, monkeypatch):
         assert a.health.min_information == pytest.approx(b.health.min_information, abs=1e-3)
 
 
-@captured
+@pytest.mark.parametrize("association", [pytest.param("vh", marks=slow), "p"])
 def test_recoveries_are_the_same(association, monkeypatch):
     """From a lost scan, an empty one, a repeated one and a gap after which a new map is started."""
     some = scans()
@@ -54,6 +54,7 @@ def test_recoveries_are_the_same(association, monkeypatch):
     assert translations.max() < 1e-3 and angles.max() < 1e-2
 
 
+@slow
 @pytest.mark.parametrize(("group", "option"), [("residual", "generalized_icp"), ("weight", "cauchy")])
 def test_other_settings_are_captured_or_run_eagerly(group, option, monkeypatch):
     override = f"{group}@odometry.vh_f2m.registration.{group}={option}"

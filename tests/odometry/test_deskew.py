@@ -10,7 +10,7 @@ from lidarlearn.odometry.deskew import deskew
 from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor
-from tests.odometry.odometries import build, kd_at_least, motion_errors, poses, run, scans_of, street
+from tests.odometry.odometries import ASSOCIATIONS, build, kd_at_least, motion_errors, poses, run, scans_of, street
 
 MOTION = se3.exp(torch.tensor([1.3, 0.1, -0.05, 0.01, -0.02, 0.09], dtype=torch.float64))
 QUIET = Sensor("quiet", tuple(float(e) for e in range(10, -20, -2)), 256, range_noise=0.0, drop_out=0.0, reach=math.inf)
@@ -63,8 +63,9 @@ def test_points_of_one_instant_move_together():
     torch.testing.assert_close(deskew(points, torch.full((50,), 0.5), MOTION), se3.transform(half, points))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["highway", "segway"])
-@kd_at_least
+@pytest.mark.parametrize("association", ASSOCIATIONS)
 def test_deskewing_lowers_the_error_at_high_speed_and_when_the_sensor_swings(world, association):
     """On the Segway constant velocity alone gains nothing: no scan moves as the one before it."""
     drive = Drive(world, seed=7, frames=40, motion_distortion=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lidarlearn.evaluation.convergence import Basin, Probe, convergence_basin
 from tests import pretend_device
-from tests.odometry.odometries import build, composed, kd_at_least, poses, run, scans, street
+from tests.odometry.odometries import ASSOCIATIONS, build, composed, kd_at_least, poses, run, scans, street
 
 SCANS = 5
 LAUNCHES, TRANSFERS = 1500, 100  # at most, for a scan
@@ -44,7 +44,8 @@ def basin_elsewhere(association: str) -> Basin:
 
 
 @pytest.mark.skipif(not pretend_device.IS_SUPPORTED, reason="needs a more recent torch")
-@kd_at_least
+@pytest.mark.slow
+@pytest.mark.parametrize("association", ASSOCIATIONS)
 def test_basins_are_measured_on_another_device(association):
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
         elsewhere = process.submit(basin_elsewhere, association).result()
