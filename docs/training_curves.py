@@ -9,7 +9,7 @@ from pathlib import Path
 from matplotlib.ticker import MaxNLocator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from lidarlearn.evaluation.plots import Panel, curves_figure, write_plots
+from lidarlearn.evaluation.plots import Panel, curves_figure
 
 _IMAGES = Path(__file__).parent / "images"
 _PANELS = {
@@ -27,7 +27,7 @@ def main(runs: list[Path]) -> None:
     figure = curves_figure("validation drives", panels)
     for axes in figure.axes:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    write_plots(_IMAGES, [("training_curves", figure)])
+    figure.savefig(_IMAGES / "training_curves.png")
 
 
 def curve(events: EventAccumulator, tag: str) -> dict[float, float]:

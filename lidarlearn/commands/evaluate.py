@@ -3,7 +3,6 @@
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,8 @@ from lidarlearn.commands.run_folder import code_digest, held_run_folder, write_r
 from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.methods import Method, parse_method
-from lidarlearn.evaluation.plots import figures, write_plots
-from lidarlearn.evaluation.report import print_tables, report_tables, seen_in_training, write_report
+from lidarlearn.evaluation.plots import figures
+from lidarlearn.evaluation.report import print_tables, write_report
 from lidarlearn.evaluation.run import Export, read_export, run_odometry
 from lidarlearn.evaluation.score import Score, score
 from lidarlearn.evaluation.submission import is_kitti_test_set, write_submission
@@ -43,22 +42,7 @@ def main() -> None:
         entry_point.run(_evaluate_locked, "evaluate", lambda: add_data(sys.argv, Path(folder)))
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """The result of an evaluation.
-
-    Args:
-        sequences: the sequences by name.
-        T_world_lidar: estimated poses by method and sequence.
-        scores: one per method and sequence.
-    """
-
-    sequences: Mapping[str, Sequence]
-    T_world_lidar: Mapping[str, Mapping[str, Tensor]]
-    scores: list[Score]
-
-
-def evaluate(config: DictConfig, data_name: str) -> Evaluation:
+def evaluate(config: DictConfig, data_name: str) -> None:
     """Run methods or read trajectories, score them, and write everything into the run folder.
 
     After an error the finished sequences are reported before the error is raised again.
@@ -70,7 +54,8 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
     Raises:
         UserError: the data, the checkpoint, a trajectory or a setting is invalid.
     """
-    _seed(config.seed)
+    torch.manual_seed(config.seed)
+    np.random.seed(config.seed)
     resolve_device(config)
     run_folder = Path(config.run_dir)
     methods = _methods(config)
@@ -95,14 +80,13 @@ def evaluate(config: DictConfig, data_name: str) -> Evaluation:
             poses.setdefault(row.method, {})[row.sequence] = T_world_lidar
     finally:
         if scores:
-            _report(run_folder, protocol, Evaluation(sequences, poses, scores), layout)
+            _report(run_folder, protocol, sequences, poses, scores, layout)
     if is_kitti_test_set(sequences.values()):
         for method in methods:
             packed = write_submission(
                 run_folder / f"submission_{method}.zip", run_folder / "trajectories" / str(method)
             )
             print(f"for KITTI's test server: {packed}")
-    return Evaluation(sequences, poses, scores)
 
 
 def _run_methods(
@@ -206,23 +190,24 @@ def _methods(config: DictConfig) -> list[Method]:
     return [configured_method(config, name) for name in names]
 
 
-def _seed(seed: int) -> None:
-    torch.manual_seed(seed)
-    np.random.seed(seed)
-
-
-def _report(run_folder: Path, protocol: dict[str, Any], evaluation: Evaluation, layout: TableLayout | None) -> None:
+def _report(
+    run_folder: Path,
+    protocol: Mapping[str, Any],
+    sequences: Mapping[str, Sequence],
+    poses: Mapping[str, Mapping[str, Tensor]],
+    scores: list[Score],
+    layout: TableLayout | None,
+) -> None:
     """Files, plots, TensorBoard and the printed tables."""
     from torch.utils.tensorboard import SummaryWriter  # slow to import, only needed at the end
 
-    scores, poses = evaluation.scores, evaluation.T_world_lidar
-    seen = seen_in_training(protocol, scores)
-    write_report(run_folder, protocol, scores, seen, layout)
-    groups = {} if layout is None else layout.columns
+    tables = write_report(run_folder, protocol, scores, layout)
+    plots = run_folder / "plots"
+    plots.mkdir(exist_ok=True)
     with SummaryWriter(str(run_folder)) as writer:
-        for name, figure in figures(evaluation.sequences, poses, scores, groups):
-            write_plots(run_folder / "plots", [(name, figure)])
+        for name, figure in figures(sequences, poses, scores, {} if layout is None else layout.columns):
+            figure.savefig(plots / f"{name}.png")
             writer.add_figure(name, figure)
         writer.add_text("results", (run_folder / "results.md").read_text(encoding="utf-8"))
-    print_tables(report_tables(protocol["data"], scores, seen, layout))
-    print(f"results: {run_folder / 'results.md'}  plots: {run_folder / 'plots'}")
+    print_tables(tables)
+    print(f"results: {run_folder / 'results.md'}  plots: {plots}")

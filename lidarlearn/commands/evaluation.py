@@ -18,7 +18,6 @@ from lidarlearn.data.sequence import DataSet
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.convergence import basin_figure, basin_tables, convergence_basin
 from lidarlearn.evaluation.maps import MapSettings
-from lidarlearn.evaluation.plots import write_plots
 from lidarlearn.evaluation.report import print_tables
 from lidarlearn.progress import progress
 
@@ -80,8 +79,8 @@ def _measure_convergence(config: DictConfig, folder: Path) -> None:
     measured = json.dumps({name: asdict(basin) for name, basin in basins.items()}, indent=2)
     (folder / "convergence.json").write_text(measured + "\n", encoding="utf-8")
     print_tables(basin_tables(basins))
-    (plot,) = write_plots(folder, [("convergence", basin_figure(f"sequence {sequence.name}", basins))])
-    print(f"results: {folder / 'convergence.json'}  plot: {plot}")
+    basin_figure(f"sequence {sequence.name}", basins).savefig(folder / "convergence.png")
+    print(f"results: {folder / 'convergence.json'}  plot: {folder / 'convergence.png'}")
 
 
 def _compare(arguments: list[str]) -> None:

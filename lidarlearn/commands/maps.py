@@ -14,7 +14,6 @@ from lidarlearn.data.writable import atomic_write
 from lidarlearn.errors import UserError
 from lidarlearn.evaluation.map_figure import map_figure
 from lidarlearn.evaluation.maps import MapSettings, build_map
-from lidarlearn.evaluation.plots import write_plots
 from lidarlearn.evaluation.report import print_tables
 from lidarlearn.evaluation.run import Export, read_export
 from lidarlearn.evaluation.tables import Table
@@ -109,7 +108,7 @@ def _make_map(run: Path, export: Export, sequence: Sequence, settings: MapSettin
         {method: T_world_lidar},
         sequence.T_world_lidar,
     )
-    write_plots(path.parent, [(sequence.name, figure)])
+    figure.savefig(path.with_name(f"{sequence.name}.png"))
     return {
         "method": method,
         "sequence": sequence.name,

@@ -5,9 +5,8 @@ Pyplot is not used: it would keep every figure of a training open. Figures need 
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,8 +44,7 @@ def trajectory_figure(title: str, T_true: Poses | None, T_estimates: Mapping[str
     """
     truth = None if T_true is None else _bird_eye(T_true)
     paths = {method: _bird_eye(T_world) for method, T_world in T_estimates.items()}
-    lower, upper = _view([*paths.values(), *([] if truth is None else [truth])], truth)
-    (left, bottom), (right, top) = lower.tolist(), upper.tolist()
+    (left, bottom), (right, top) = _view(list(paths.values()), truth).tolist()
     figure = Figure(figsize=(9, 7 * (top - bottom) / (right - left) + 0.5), dpi=_DPI, layout="constrained")
     axes = figure.add_subplot()
     if truth is not None:
@@ -193,25 +191,6 @@ def figures(
             yield f"speed_distribution{suffix}", speed_figure(heading, true_kmh, estimated_kmh)
 
 
-def write_plots(folder: Path, named_figures: Iterable[tuple[str, Figure]]) -> list[Path]:
-    """Write figures as PNG files.
-
-    Args:
-        folder: created if missing.
-        named_figures: names without suffix, and figures.
-
-    Returns:
-        The written files.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for name, figure in named_figures:
-        path = folder / f"{name}.png"
-        figure.savefig(path)
-        paths.append(path)
-    return paths
-
-
 def _line(index: int) -> dict[str, Any]:
     """Colour and line style of the index-th method, the same in every figure."""
     style = _STYLES[index // len(_COLOURS) % len(_STYLES)]
@@ -224,8 +203,8 @@ def _bird_eye(T_world: Poses) -> Float[Tensor, "n 2"]:
 
 
 def _view(paths: list[Float[Tensor, "_ 2"]], truth: Float[Tensor, "n 2"] | None) -> Float[Tensor, "2 2"]:
-    """Lower and upper corner of the shown area [m]: all paths, except where they stray far from the truth."""
-    points = torch.cat(list(paths))
+    """Lower and upper corner of the shown area [m]: the truth, and all paths except where they stray far from it."""
+    points = torch.cat(paths if truth is None else [*paths, truth])
     corners = torch.stack([points.amin(0), points.amax(0)])
     if truth is not None:
         lower, upper = truth.amin(0), truth.amax(0)

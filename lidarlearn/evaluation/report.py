@@ -34,9 +34,8 @@ def write_report(
     folder: Path,
     protocol: Mapping[str, Any],
     scores: list[Score],
-    seen: Seen = (),
     layout: TableLayout | None = None,
-) -> None:
+) -> list[Table]:
     """Write `results.json` and `results.md` into a folder.
 
     Args:
@@ -44,14 +43,17 @@ def write_report(
         protocol: how the scores were obtained: plain values, paths, and nested mappings and lists of these.
             `protocol["data"]` is the name of the data group.
         scores: scores of all methods on all sequences, in the order of the rows.
-        seen: methods and sequences on which their networks were trained.
         layout: the table of an experiment; None for no such table.
+
+    Returns:
+        The tables in `results.md`.
     """
     results = {"protocol": protocol, **results_content(scores)}
     if layout is not None:
         results["table"] = asdict(layout)
-    tables = report_tables(str(protocol.get("data", "")), scores, seen, layout)
-    write_results(folder, results, tables, protocol_markdown(protocol))
+    tables = report_tables(str(protocol.get("data", "")), scores, seen_in_training(protocol, scores), layout)
+    write_results(folder, results, tables, _protocol_markdown(protocol))
+    return tables
 
 
 def write_results(folder: Path, results: Mapping[str, Any], tables: list[Table], closing: str) -> None:
@@ -94,8 +96,13 @@ def report_tables(data: str, scores: list[Score], seen: Seen = (), layout: Table
     """All tables of a report.
 
     First the experiment's table, if any; then, if any sequence has ground truth, the paper's kind of table, with one
-    column per sequence; last all other metrics, with one row per method and sequence. Arguments as for `write_report`;
-    `data` is the name of the data group.
+    column per sequence; last all other metrics, with one row per method and sequence.
+
+    Args:
+        data: name of the data group.
+        scores: scores of all methods on all sequences, in the order of the rows.
+        seen: methods and sequences on which their networks were trained.
+        layout: the table of an experiment; None for no such table.
     """
     tables = [details_table(scores)]
     if any(row.path_length_m is not None for row in scores):
@@ -212,14 +219,11 @@ def _drift_notes(scores: list[Score], rows: list[tuple[str, ...]], has_reference
     return notes
 
 
-def protocol_markdown(protocol: Mapping[str, Any]) -> str:
+def _protocol_markdown(protocol: Mapping[str, Any]) -> str:
     """The closing section of `results.md`: how the results were obtained."""
-    lines = [f"- {key}: {_inline(_plain(value))}" for key, value in protocol.items()]
-    return "### Protocol\n\n" + "\n".join(lines) + "\n"
-
-
-def _inline(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    plain = {key: _plain(value) for key, value in protocol.items()}
+    texts = {k: v if isinstance(v, str) else json.dumps(v, ensure_ascii=False) for k, v in plain.items()}
+    return "### Protocol\n\n" + "".join(f"- {key}: {text}\n" for key, text in texts.items())
 
 
 def _text(value: float | int | None, digits: int, scale: float = 1.0) -> str:
@@ -230,7 +234,7 @@ def _plain(value: Any) -> Any:
     """The value in types that JSON has; floats that are not finite are undefined and become null."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
+    if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     if isinstance(value, PathLike):
         return str(value)

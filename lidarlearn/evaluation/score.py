@@ -1,9 +1,9 @@
 """Score a trajectory against the ground truth of its sequence, and average scores over sequences."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import TypeVar
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -15,8 +15,6 @@ from lidarlearn.metrics.absolute import ape_rmse
 from lidarlearn.metrics.failures import registration_failures
 from lidarlearn.metrics.kitti import SegmentAverage
 from lidarlearn.metrics.relative import relative_pose_error, relative_translation_error
-
-Number = TypeVar("Number", int, float)
 
 
 @dataclass(frozen=True)
@@ -194,23 +192,12 @@ def _require_scorable(method: str, T_world_lidar: Tensor, sequence: Sequence) ->
 
 
 def _over_sequences(rows: list[Score]) -> MeanOverSequences:
-    def mean(value: Callable[[Score], float | None]) -> float | None:
-        defined = _defined(value(row) for row in rows)
-        return sum(defined) / len(defined) if defined else None
-
-    failures = _defined(row.registration_failures for row in rows)
-    return MeanOverSequences(
-        sequences=sum(bool(row.segments) for row in rows),
-        avg_translation_error_percent=mean(lambda row: row.avg_translation_error_percent),
-        avg_rotation_error_deg_per_100m=mean(lambda row: row.avg_rotation_error_deg_per_100m),
-        ape_rmse_m=mean(lambda row: row.ape_rmse_m),
-        rpe_translation_m=mean(lambda row: row.rpe_translation_m),
-        rpe_translation_mean_m=mean(lambda row: row.rpe_translation_mean_m),
-        rpe_rotation_deg=mean(lambda row: row.rpe_rotation_deg),
-        relative_translation_error_percent=mean(lambda row: row.relative_translation_error_percent),
-        registration_failures=sum(failures) if failures else None,
-        frames_per_second=mean(lambda row: row.frames_per_second),
-    )
+    names = [entry.name for entry in fields(MeanOverSequences) if entry.name != "sequences"]
+    defined = {name: [value for row in rows if (value := getattr(row, name)) is not None] for name in names}
+    means: dict[str, Any] = {name: sum(values) / len(values) if values else None for name, values in defined.items()}
+    means["sequences"] = sum(bool(row.segments) for row in rows)
+    means["registration_failures"] = sum(defined["registration_failures"]) if defined["registration_failures"] else None
+    return MeanOverSequences(**means)
 
 
 def _over_segments(rows: list[Score]) -> MeanOverSegments:
@@ -219,7 +206,3 @@ def _over_segments(rows: list[Score]) -> MeanOverSegments:
         return MeanOverSegments(0, None, None)
     pooled = _pool(list(by_length.values()))
     return MeanOverSegments(pooled.segments, pooled.translation_percent, pooled.rotation_deg_per_100m)
-
-
-def _defined(values: Iterable[Number | None]) -> list[Number]:
-    return [value for value in values if value is not None]

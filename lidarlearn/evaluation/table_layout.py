@@ -58,7 +58,8 @@ class TableLayout:
             (f"{method} ({self.source})", *("-" if value is None else f"{value:g}" for value in values))
             for method, values in self.published.items()
         ]
-        notes = [f"Each cell: {what}; {_pooling(self.figure)} the sequences of its column."]
+        pooled = "sum" if self.figure == "registration_failures" else "mean"
+        notes = [f"Each cell: {what}; the {pooled} over the sequences of its column."]
         notes += [f"{heading}: {', '.join(names)}." for heading, names in self.columns.items() if heading not in names]
         if any("*" in cell for row in rows for cell in row):
             notes.append("*: the network was trained on these sequences.")
@@ -84,7 +85,3 @@ class TableLayout:
         star = "*" if all((method, row.sequence) in seen for row in rows) else ""
         run = len({row.sequence for row in rows})
         return f"{value:.{digits}f}{star}" + (f" ({run} of {len(names)})" if run < len(names) else "")
-
-
-def _pooling(figure: str) -> str:
-    return "the sum over" if figure == "registration_failures" else "the mean over"

@@ -1,6 +1,5 @@
 """Find and read trajectory files in KITTI's and TUM's formats, and convert their poses between frames."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -144,7 +143,8 @@ def find_trajectories(path: Path, sequences: list[str]) -> dict[str, dict[str, P
             f"{path.absolute()}: no such file or folder of trajectories.\n  change: trajectories=PATH"
         )
     path = path / "trajectories" if (path / "trajectories").is_dir() else path
-    found = {folder.absolute().name: _in_folder(folder, sequences) for folder in _candidates(path)}
+    folders = [path, *sorted(p for p in path.iterdir() if p.is_dir())]
+    found = {folder.absolute().name: _in_folder(folder, sequences) for folder in folders}
     found = {method: files for method, files in found.items() if files}
     if not found:
         there = ", ".join(sorted(p.name for p in path.iterdir())[:8]) or "nothing"
@@ -160,11 +160,6 @@ def find_trajectories(path: Path, sequences: list[str]) -> dict[str, dict[str, P
                 f"  change: add the files, or set data.test_sequences={list(files)}"
             )
     return found
-
-
-def _candidates(path: Path) -> Iterator[Path]:
-    yield path
-    yield from sorted(p for p in path.iterdir() if p.is_dir())
 
 
 def _in_folder(folder: Path, sequences: list[str]) -> dict[str, Path]:
@@ -192,14 +187,11 @@ def _require_rotations(path: Path, T_world: Float[Tensor, "n 4 4"]) -> None:
     bad = (deviation > _MAX_DEVIATION) | (torch.linalg.det(R) < 0)
     if bool(bad.any()):
         row = int(bad.int().argmax())
+        numbers = [[round(value, 3) for value in line] for line in R[row].tolist()]
         raise TrajectoryError(
-            f"{path.absolute()}: the 3x3 part of row {row + 1} is not a rotation: {_short(R[row])}.\n"
+            f"{path.absolute()}: the 3x3 part of row {row + 1} is not a rotation: {numbers}.\n"
             "  change: write the upper 3x4 part of each pose row by row (r11 r12 r13 tx r21 ...)"
         )
-
-
-def _short(R: Float[Tensor, "3 3"]) -> str:
-    return str([[round(value, 3) for value in row] for row in R.tolist()])
 
 
 def _match(

@@ -19,7 +19,7 @@ from lidarlearn.evaluation.score import Score, score
 PROTOCOL = {
     "data": "simulated_urban",
     "sequences": ("a", "short"),
-    "checkpoint": {"path": Path("runs/best.ckpt"), "sha256": "00ff"},
+    "checkpoint": {"path": Path("runs/best.ckpt"), "trained_on": {"train_sequences": ["b"]}},
     "seed": 0,
     "odd": math.nan,
 }
@@ -173,7 +173,7 @@ def test_results_md_and_the_terminal_show_the_same_tables(tmp_path, scores):
     text = (tmp_path / "results.md").read_text()
     assert drift_table("simulated_urban", scores).markdown() in text
     assert details_table(scores).markdown() in text
-    assert '- checkpoint: {"path": "runs/best.ckpt", "sha256": "00ff"}' in text
+    assert '- checkpoint: {"path": "runs/best.ckpt", "trained_on": {"train_sequences": ["b"]}}' in text
     out = StringIO()
     print_tables(report_tables("simulated_urban", scores), console=Console(file=out, width=200))
     printed = out.getvalue()
