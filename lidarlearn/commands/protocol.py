@@ -27,7 +27,7 @@ def describe_networks(config: DictConfig, methods: Iterable[Method]) -> dict[str
         CheckpointError: a file is no checkpoint.
     """
     used = dict.fromkeys(m.initialization for m in methods if m.initialization in config.networks)
-    missing = [_remedy(name, config.networks[name]) for name in used if not _is_file(config.networks[name])]
+    missing = [_remedy(name, config.networks[name]) for name in used if not Path(config.networks[name] or "").is_file()]
     if missing:
         raise UserError("\n".join(missing))
     return {name: _checkpoint(Path(config.networks[name])) for name in used}
@@ -98,10 +98,6 @@ def ground_truth_digest(sequence: Sequence) -> str | None:
         return None
     poses = torch.cat([sequence.T_world_lidar, sequence.T_reference_lidar[None]])
     return hashlib.sha256((poses * _STEPS_PER_M).round().long().numpy().tobytes()).hexdigest()[:16]
-
-
-def _is_file(path: str | None) -> bool:
-    return path is not None and Path(path).is_file()
 
 
 def _remedy(network: str, path: str | None) -> str:

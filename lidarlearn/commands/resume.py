@@ -4,9 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from torch import nn
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler
 
 from lidarlearn.commands.checkpoint_options import (
     GLOBAL,
@@ -20,9 +17,7 @@ from lidarlearn.commands.checkpoint_options import (
 )
 from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.module import PoseNetModule
-from lidarlearn.training.parts import require_plain, require_trusted
-
-_FIXED = {"model": nn.Module, "loss": nn.Module, "optimizer": Optimizer, "scheduler": LRScheduler}
+from lidarlearn.training.parts import PARTS, require_plain, require_trusted
 
 # Settings that the result depends on, besides the parts and the data; devices, paths and displays may change.
 _OF_DATAMODULE = ("batch_size", "augmentation")
@@ -65,9 +60,10 @@ def add_settings(arguments: list[str], folder: Path) -> None:
     parts = checkpoint["hyper_parameters"]
     trained_on = parts["trained_on"]
     settings = trained_on.get("settings", {})
-    for part, kind in {**_FIXED, "module": PoseNetModule}.items():
-        require_trusted({"_target_": checkpoint["module"]} if part == "module" else parts[part], kind)
-    of_module = {key: value for key, value in parts.items() if key not in (*_FIXED, "trained_on")}
+    for part, kind in PARTS.items():
+        require_trusted(parts[part], kind)
+    require_trusted({"_target_": checkpoint["module"]}, PoseNetModule)
+    of_module = {key: value for key, value in parts.items() if key not in (*PARTS, "trained_on")}
     require_plain({**settings, **of_module})
     name = settings.get("scheduler", OPTION)
     of_projection = {key: trained_on["projection"][key] for key in ("height", "width")}

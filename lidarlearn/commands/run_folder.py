@@ -64,15 +64,12 @@ def held_run_folder(folder: Path) -> Iterator[Path]:
             f"  change: {elsewhere}"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / ".lock")
     try:
-        lock.acquire(timeout=0)
+        lock = FileLock(folder / ".lock").acquire(timeout=0)
     except Timeout:
         raise UserError(f"{folder}: another process writes its results there\n  change: {elsewhere}, or wait") from None
-    try:
+    with lock:
         yield folder
-    finally:
-        lock.release()
 
 
 def write_run_description(folder: Path, config: DictConfig) -> None:

@@ -5,6 +5,7 @@ import string
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -198,7 +199,6 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
     def plain(node: str) -> dict[str, Any]:
         return OmegaConf.to_container(config[node], resolve=True)  # type: ignore[return-value]
 
-    p = datamodule.projection
     trained_on = {
         "data": {key: value for key, value in plain("data").items() if key != "root"},
         "data_name": data_name,
@@ -207,12 +207,7 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
         "git": git_revision(),
         "lidarlearn": lidarlearn.__version__,
         "settings": settings_to_keep(config),
-        "projection": {
-            "height": p.height,
-            "width": p.width,
-            "fov_up_deg": p.fov_up_deg,
-            "fov_down_deg": p.fov_down_deg,
-        },
+        "projection": asdict(datamodule.projection),
     }
     parts = {node: plain(node) for node in ("model", "loss", "optimizer")}
     parts["scheduler"] = plain("schedulers")[config.scheduler]

@@ -40,7 +40,7 @@ class _Drawing(Callback):
         every_n_epochs: least number of epochs between two drawings; more if validation runs less often.
     """
 
-    def __init__(self, every_n_epochs: int) -> None:
+    def __init__(self, every_n_epochs: int = 1) -> None:
         self.every_n_epochs = every_n_epochs
         self._last_epoch: int | None = None
 
@@ -107,9 +107,6 @@ class Trajectories(_Drawing):
     Args:
         every_n_epochs: least number of epochs between two drawings.
     """
-
-    def __init__(self, every_n_epochs: int = 1) -> None:
-        super().__init__(every_n_epochs)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the trajectories that the module has just predicted."""

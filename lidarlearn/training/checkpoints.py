@@ -8,10 +8,11 @@ from typing import Any
 import torch
 
 from lidarlearn.errors import UserError
+from lidarlearn.training.parts import PARTS
 
 # Keys that every checkpoint has: at the top, in its "hyper_parameters", and in their "trained_on".
 _KEYS = ("module", "hyper_parameters", "state_dict")
-_HYPER_PARAMETER_KEYS = ("model", "loss", "optimizer", "scheduler", "trained_on")
+_HYPER_PARAMETER_KEYS = (*PARTS, "trained_on")
 _TRAINED_ON_KEYS = ("data", "data_name", "loss", "git", "projection")
 
 

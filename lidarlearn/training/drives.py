@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data.sequence import Sequence
+from lidarlearn.evaluation.trajectory_files import to_reference_frame
 from lidarlearn.geometry import se3
 from lidarlearn.metrics import kitti
 from lidarlearn.metrics.relative import relative_errors, relative_translation_error
@@ -71,10 +72,10 @@ def drive_errors(drive: PredictedDrive) -> DriveErrors | None:
         return None
     relative = relative_errors(drive.T_world_lidar, drive.T_world_lidar_true)
     share = relative_translation_error(drive.T_world_lidar, drive.T_world_lidar_true)
-    C = drive.T_reference_lidar
-    segments = kitti.average(
-        kitti.segment_errors(C @ drive.T_world_lidar @ C.inverse(), C @ drive.T_world_lidar_true @ C.inverse())
+    estimate, truth = (
+        to_reference_frame(T, drive.T_reference_lidar) for T in (drive.T_world_lidar, drive.T_world_lidar_true)
     )
+    segments = kitti.average(kitti.segment_errors(estimate, truth))
     return DriveErrors(
         avg_translation_error_percent=None if segments is None else segments.translation_percent,
         mean_relative_translation_error_m=float(relative.translation.mean()),

@@ -39,8 +39,6 @@ class PoseNetModule(LightningModule):
             `lidarlearn.commands.resume`).
     """
 
-    predicted_drives: list[PredictedDrive]
-
     def __init__(
         self,
         model: dict[str, Any],
@@ -54,7 +52,7 @@ class PoseNetModule(LightningModule):
         self.projection = SphericalProjection(**trained_on["projection"])
         self.model = build(model, nn.Module)
         self.loss = build(loss, nn.Module)
-        self.predicted_drives = []
+        self.predicted_drives: list[PredictedDrive] = []
         self._predictions: list[list[tuple[Tensor, Tensor]]] = []
         self._val_losses: list[LossResult] = []
 

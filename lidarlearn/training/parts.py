@@ -5,12 +5,19 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
+from torch import nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
 from lidarlearn.data.augmentation import Augmentation
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation.sensors import Sensor
 
 TRUSTED_PACKAGES = ("lidarlearn.", "torch.optim.")
+
+# The parts of a training, by the keys of the dicts that describe them in a checkpoint.
+PARTS = {"model": nn.Module, "loss": nn.Module, "optimizer": Optimizer, "scheduler": LRScheduler}
 
 # What may be built within a part, by key: only classes whose constructors are known to have no side effects.
 _NESTED_PARTS = {"projection": SphericalProjection, "sensor": Sensor, "augmentation": Augmentation}
@@ -47,7 +54,8 @@ def build(node: Mapping[str, Any], kind: type, **arguments: Any) -> Any:
     try:
         inspect.signature(target).bind(**merged)
     except TypeError as error:
-        raise UserError(f"{name}: {error}\n  change: its keys are {_keys(target)}") from error
+        keys = ", ".join(inspect.signature(target).parameters)
+        raise UserError(f"{name}: {error}\n  change: its keys are {keys}") from error
     try:
         return target(**merged)
     except (TypeError, ValueError) as error:  # the constructor rejects a value
@@ -131,7 +139,3 @@ def _trusted(name: object, kind: type) -> Any:
     if not trusted:
         raise UntrustedTargetError(f"_target_ {name!r}", allowed)
     return target
-
-
-def _keys(target: type) -> str:
-    return ", ".join(name for name in inspect.signature(target).parameters if name != "self")

@@ -11,10 +11,8 @@ from lightning.pytorch.utilities import rank_zero_warn
 from lidarlearn.errors import UserError
 from lidarlearn.training.checkpoints import load_checkpoint
 from lidarlearn.training.module import PoseNetModule
-from lidarlearn.training.parts import argument
+from lidarlearn.training.parts import PARTS, argument
 from lidarlearn.training.progress import time_left_s
-
-_FIXED_PARTS = ("model", "loss", "optimizer", "scheduler")
 
 
 def require_resumable(path: Path, module: PoseNetModule, trainer: Trainer) -> None:
@@ -26,7 +24,7 @@ def require_resumable(path: Path, module: PoseNetModule, trainer: Trainer) -> No
         trainer: its limits count from the very first start.
     """
     checkpoint = load_checkpoint(path)
-    for part in _FIXED_PARTS:
+    for part in PARTS:
         _require_unchanged(path, part, checkpoint["hyper_parameters"][part], module.hparams[part])
     loop = checkpoint["loops"]["fit_loop"]
     epochs, batches = loop["epoch_progress"]["current"], loop["epoch_loop.batch_progress"]
