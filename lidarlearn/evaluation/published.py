@@ -9,7 +9,7 @@ Sources: each method's own paper; for LOAM, SuMa and DeepLO, later papers that q
 of "What's in My LiDAR Odometry Toolbox?"; "re-run" means with the released code and its defaults.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 from lidarlearn.evaluation.score import Score
@@ -97,7 +97,6 @@ def whole_kitti_sequences(data: str, scores: Iterable[Score]) -> list[str]:
     return list(dict.fromkeys(whole))
 
 
-def published_beside(data: str, scores: Iterable[Score]) -> list[Published]:
-    """Published rows with a value for at least one of the scored sequences that are whole sequences of KITTI."""
-    sequences = whole_kitti_sequences(data, scores)
-    return [row for row in KITTI if any(name in row.errors_percent for name in sequences)]
+def published_beside(sequences: Collection[str]) -> list[Published]:
+    """Published rows with a value for at least one of these whole sequences of KITTI."""
+    return [row for row in KITTI if not row.errors_percent.keys().isdisjoint(sequences)]

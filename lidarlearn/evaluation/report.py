@@ -186,7 +186,7 @@ def _reference_rows(data: str, scores: list[Score], sequences: list[str]) -> lis
     whole = whole_kitti_sequences(data, scores)
     averaged = list(dict.fromkeys(row.sequence for row in scores if row.segments))
     rows = []
-    for published in published_beside(data, scores):
+    for published in published_beside(whole):
         errors = published.errors_percent
         mean = published.sequence_mean_percent(averaged) if set(averaged) <= set(whole) else None
         pooled = published.segment_mean_percent if len(averaged) == len(whole) == 11 else ""

@@ -46,7 +46,7 @@ def test_only_whole_sequences_of_kitti_count():
 
 
 def test_rows_without_a_figure_for_these_sequences_are_left_out():
-    on_09 = {row.method for row in published_beside("kitti_00-08", rows(s09=1591))}
-    on_00 = {row.method for row in published_beside("kitti_00-08", rows(s00=4541))}
+    on_09 = {row.method for row in published_beside(["09"])}
+    on_00 = {row.method for row in published_beside(["00"])}
     assert on_09 - on_00 == {"DeLORA 00-08, unsupervised", "RSLO 00-06, unsupervised"}
-    assert published_beside("kitti_00-08", rows(s04=51)) == []
+    assert published_beside(whole_kitti_sequences("kitti_00-08", rows(s04=51))) == []
