@@ -123,7 +123,7 @@ class FordCampus(DataSetOnDisk):
     def _open(
         self, name: str, scans: ScanFiles, read: Callable[[str, ScanFiles], NDArray[np.float64]]
     ) -> FordCampusSequence:
-        layout.refuse_deskew(self.title, self.deskew)
+        self.refuse_deskew()
         self.require_scans(name, scans, "Scan*.mat")
         warn_of_gaps(name, scans)
         stamped = read(name, scans)

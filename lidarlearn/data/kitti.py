@@ -88,7 +88,7 @@ class KittiOdometry(DataSetOnDisk):
 
     def sequence(self, name: str) -> KittiOdometrySequence:
         """Open a sequence."""
-        layout.refuse_deskew(self.title, self.deskew)
+        self.refuse_deskew()
         folder = self.root / "sequences" / name
         scans = self._scans(name).first(self.max_frames)
         self.require_scans(name, scans, "*.bin")

@@ -1,54 +1,11 @@
-"""Shared parts of the layout checks: describe files by names and sizes, and find the right folder level."""
+"""Shared parts of the layout checks: describe files by their names, sizes and numbers of rows."""
 
-import itertools
-from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from lidarlearn.data.errors import ROOT_REMEDY
-from lidarlearn.data.scan_files import ScanFiles, examples, full_path, gaps, is_folder, subfolders
+from lidarlearn.data.scan_files import ScanFiles, examples, gaps
 from lidarlearn.data.sequence import LayoutReport
-from lidarlearn.errors import UserError
-
-
-def find_root(root: Path, is_root: Callable[[Path], bool]) -> Path | None:
-    """The folder that looks like the root of a data set: `root`, or up to two levels below or above it.
-
-    None if there is no such folder, or if `root` itself does not exist: then its surroundings mean nothing.
-    """
-    if not is_folder(root):
-        return None
-    below = subfolders(root)
-    grandchildren = (path for folder in below for path in subfolders(folder))
-    candidates = itertools.chain([root], below, grandchildren, list(full_path(root).parents)[:2])
-    return next((path for path in candidates if is_root(path)), None)
-
-
-def describe_root(report: LayoutReport, root: Path, is_root: Callable[[Path], bool], marker: str, source: str) -> bool:
-    """Note whether the root is at the right folder level, or which folder seems to be.
-
-    Args:
-        report: the report to extend.
-        root: as configured.
-        is_root: recognises the right level.
-        marker: what the right level holds, for the message.
-        source: where the data comes from.
-
-    Returns:
-        Whether the root is at the right level.
-    """
-    if is_root(root):
-        report.found("root", str(root))
-        return True
-    near = find_root(root, is_root)
-    if near is not None:
-        report.missing("root", f"wrong folder level: {root} holds no {marker}, but {near} does")
-        report.remedy = f"data.root={near}"
-    else:
-        report.missing("root", f"{root} holds no {marker}" if is_folder(root) else f"{root}: no such folder")
-        report.remedy = f"{ROOT_REMEDY}; get the data from {source}"
-    return False
 
 
 def describe_scans(
@@ -115,31 +72,6 @@ def count_rows(path: Path) -> int:
     """Number of lines of a text file without blank ones at the end; blank lines within stand for dropped frames."""
     with path.open("rb") as file:
         return max((number for number, line in enumerate(file, start=1) if line.strip()), default=0)
-
-
-def refuse_deskew(title: str, deskew: bool) -> None:
-    """Raise UserError if compensated scans are to be deskewed, which would distort them."""
-    if deskew:
-        raise UserError(f"{title}: its scans are motion compensated already.\n  change: data.deskew=false")
-
-
-def describe_unconfigured(report: LayoutReport, found: Mapping[str, ScanFiles], configured: Iterable[str]) -> None:
-    """Note the sequences that exist but are not configured."""
-    named = set(configured)
-    for name, scans in found.items():
-        if name not in named:
-            report.found(name, f"there ({len(scans)} files), but not among the configured sequences")
-
-
-def suggest_sequences(report: LayoutReport, found: Iterable[str]) -> None:
-    """Set the report's remedy if some of the configured sequences cannot be used."""
-    if report.usable or report.remedy:
-        return
-    there = examples(found)
-    report.remedy = (
-        "complete what is missing, or name only sequences that are there"
-        f" ({there or 'none'}) in data.train_sequences, data.val_sequences and data.test_sequences"
-    )
 
 
 def _files(scans: ScanFiles, chosen: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> str:

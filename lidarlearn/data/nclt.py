@@ -99,7 +99,7 @@ class Nclt(DataSetOnDisk):
 
     def sequence(self, name: str) -> NcltSequence:
         """Open a drive; scans before and after its ground truth are left out."""
-        layout.refuse_deskew(self.title, self.deskew)
+        self.refuse_deskew()
         scans = self._scans(name)
         self.require_scans(name, scans, "*.bin")
         ground_truth = self._ground_truth_file(name)

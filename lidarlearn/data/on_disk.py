@@ -1,5 +1,6 @@
 """Base of all data sets that are downloaded or recorded: a root with sequences below it, complete or in part."""
 
+import itertools
 from abc import abstractmethod
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -7,10 +8,10 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data import layout
 from lidarlearn.data.errors import ROOT_REMEDY, DataSetNotFoundError
-from lidarlearn.data.scan_files import ScanFiles, examples
+from lidarlearn.data.scan_files import ScanFiles, examples, full_path, is_folder, subfolders
 from lidarlearn.data.sequence import DataSet, LayoutReport, Sequence
+from lidarlearn.errors import UserError
 
 _NO_SETTINGS = ("name", "scans", "T_world_lidar", "timestamps")
 
@@ -75,14 +76,22 @@ class DataSetOnDisk(DataSet):
         Opening reads times, poses, calibration (see `open_for_check`) and the first scan.
         """
         report = LayoutReport()
-        if layout.describe_root(report, self.root, self.is_root, self.marker, self.source):
-            found = self._whole()
-            for name in self.names:
-                self.check_sequence(report, name)
-            layout.describe_unconfigured(report, found, self.names)
-            layout.suggest_sequences(report, found)
-            if report.usable:
-                self.open_all(report)
+        self._check_root(report)
+        if not report.usable:
+            return report
+        found = self._whole()
+        for name in self.names:
+            self.check_sequence(report, name)
+        for name in found:
+            if name not in self.names:
+                report.found(name, f"there ({len(found[name])} files), but not among the configured sequences")
+        if report.usable:
+            self.open_all(report)
+        else:
+            report.remedy = (
+                "complete what is missing, or name only sequences that are there"
+                f" ({examples(found) or 'none'}) in data.train_sequences, data.val_sequences and data.test_sequences"
+            )
         return report
 
     def not_found(self, name: str, missing: str) -> DataSetNotFoundError:
@@ -92,7 +101,7 @@ class DataSetOnDisk(DataSet):
             name: of the sequence.
             missing: what was not found.
         """
-        near = None if self.is_root(self.root) else layout.find_root(self.root, self.is_root)
+        near = None if self.is_root(self.root) else self._root_nearby()
         found = self._whole()
         if near is not None:
             remedy = f"wrong folder level, data.root={near} looks right"
@@ -104,6 +113,11 @@ class DataSetOnDisk(DataSet):
         else:
             remedy = ROOT_REMEDY
         return DataSetNotFoundError(self.title, missing, self.root, self.source, remedy)
+
+    def refuse_deskew(self) -> None:
+        """Raise a UserError if compensated scans are to be deskewed, which would distort them."""
+        if self.deskew:
+            raise UserError(f"{self.title}: its scans are motion compensated already.\n  change: data.deskew=false")
 
     def require_scans(self, name: str, scans: ScanFiles, pattern: str) -> None:
         """Raise DataSetNotFoundError if a sequence has no scans; `pattern` of their names is for the message."""
@@ -119,6 +133,30 @@ class DataSetOnDisk(DataSet):
         if not path.is_file():
             raise self.not_found(name, str(path.relative_to(self.root)))
         return path
+
+    def _check_root(self, report: LayoutReport) -> None:
+        """Note whether the root is at the right folder level, or which folder seems to be."""
+        if self.is_root(self.root):
+            report.found("root", str(self.root))
+        elif near := self._root_nearby():
+            report.missing("root", f"wrong folder level: {self.root} holds no {self.marker}, but {near} does")
+            report.remedy = f"data.root={near}"
+        else:
+            seen = f"{self.root} holds no {self.marker}" if is_folder(self.root) else f"{self.root}: no such folder"
+            report.missing("root", seen)
+            report.remedy = f"{ROOT_REMEDY}; get the data from {self.source}"
+
+    def _root_nearby(self) -> Path | None:
+        """The folder up to two levels below or above a wrong root that looks like the right one.
+
+        None if there is no such folder, or if `root` does not exist: then its surroundings mean nothing.
+        """
+        if not is_folder(self.root):
+            return None
+        below = subfolders(self.root)
+        grandchildren = (path for folder in below for path in subfolders(folder))
+        nearby = itertools.chain(below, grandchildren, list(full_path(self.root).parents)[:2])
+        return next((path for path in nearby if self.is_root(path)), None)
 
     def _whole(self) -> dict[str, ScanFiles]:
         """The existing sequences with at least one scan."""
