@@ -5,6 +5,7 @@ reflectance in the LiDAR's frame. Poses are those of the left camera; `Tr` in ca
 number selects its row of poses and times, so a copy may hold any part of the scans.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,11 +96,12 @@ class KittiOdometry(DataSetOnDisk):
         calibration = self.require_file(name, folder / "calib.txt")
         warn_of_gaps(name, scans)
         T_camera_lidar = read_labelled_transform(calibration, "Tr:")
+        T_world_camera = _rows_of(scans, self.root / "poses" / f"{name}.txt", read_kitti_poses)
         return KittiOdometrySequence(
             name=name,
             scans=scans,
-            T_world_lidar=self._ground_truth(name, scans, T_camera_lidar),
-            timestamps=self._timestamps(folder / "times.txt", scans),
+            T_world_lidar=None if T_world_camera is None else start_at_identity(T_world_camera @ T_camera_lidar),
+            timestamps=_rows_of(scans, folder / "times.txt", read_times),
             T_reference_lidar=T_camera_lidar,
             beam_correction_deg=self.beam_correction_deg,
         )
@@ -132,24 +134,12 @@ class KittiOdometry(DataSetOnDisk):
     def _scans(self, name: str) -> ScanFiles:
         return list_scans(self.root / "sequences" / name / "velodyne", (".bin",), r"\d{6}", "000000.bin")
 
-    def _ground_truth(
-        self, name: str, scans: ScanFiles, T_camera_lidar: Float[Tensor, "4 4"]
-    ) -> Float[Tensor, "n 4 4"] | None:
-        path = self.root / "poses" / f"{name}.txt"
-        if not path.is_file():
-            return None
-        T_world_camera = read_kitti_poses(path)
-        _require_rows(path, len(T_world_camera), scans)
-        return start_at_identity(T_world_camera[scans.numbers] @ T_camera_lidar)
 
-    def _timestamps(self, path: Path, scans: ScanFiles) -> Float[Tensor, "n"] | None:
-        if not path.is_file():
-            return None
-        times = read_times(path)
-        _require_rows(path, len(times), scans)
-        return times[scans.numbers]
-
-
-def _require_rows(path: Path, rows: int, scans: ScanFiles) -> None:
-    if rows <= scans.numbers[-1]:
-        raise DamagedFileError(path, f"{rows} rows, too few for scan {scans.names[-1]} in {scans.folder}")
+def _rows_of(scans: ScanFiles, path: Path, read: Callable[[Path], Tensor]) -> Tensor | None:
+    """The row of each scan in a file of poses or times; None if there is no such file."""
+    if not path.is_file():
+        return None
+    rows = read(path)
+    if len(rows) <= scans.numbers[-1]:
+        raise DamagedFileError(path, f"{len(rows)} rows, too few for scan {scans.names[-1]} in {scans.folder}")
+    return rows[scans.numbers]

@@ -44,12 +44,12 @@ class Drive:
     Args:
         name: e.g. 2011_09_26_drive_0009.
         first: number of the first scan.
-        last: number of the last scan, None for all.
+        last: number of the last scan, infinity for all.
     """
 
     name: str
     first: int = 0
-    last: int | None = None
+    last: float | int = math.inf
 
 
 # Sequences of KITTI odometry by number. Source: readme.txt of the odometry development kit. 03 is no longer published.
@@ -179,10 +179,9 @@ class KittiRaw(DataSetOnDisk):
         for end in ("start", "end"):
             stamps = folder / "velodyne_points" / f"timestamps_{end}.txt"
             layout.describe_rows(report, name, stamps, f"{end} times", rows_needed, needed=True)
-        ground_truth_needed = name in self.test_sequences
-        note = report.missing if ground_truth_needed else report.odd
         packets = _packets(folder).numbers
         if not packets:
+            note = report.missing if name in self.test_sequences else report.odd
             note(name, f"no ground truth: no files in {folder / 'oxts' / 'data'}")
             return
         if len(packets) < rows_needed:
@@ -199,8 +198,7 @@ class KittiRaw(DataSetOnDisk):
     def _scans(self, name: str) -> ScanFiles:
         drive = _drive(name)
         scans = list_scans(self._folder(name) / "velodyne_points" / "data", (".bin",), r"\d{10}", "0000000000.bin")
-        last = math.inf if drive.last is None else drive.last
-        return scans.select(i for i, number in enumerate(scans.numbers) if drive.first <= number <= last)
+        return scans.select(i for i, number in enumerate(scans.numbers) if drive.first <= number <= drive.last)
 
     def _timestamps(self, name: str, scans: ScanFiles) -> Float[Tensor, "n"]:
         files = (scans.folder.parent / f"timestamps_{end}.txt" for end in ("start", "end"))

@@ -29,15 +29,11 @@ from lidarlearn.geometry.projection import SphericalProjection
 
 BEAMS, COLUMNS = 64, 1024
 PERIOD_S = 0.1
-
-
-def _left_camera_to_lidar() -> Float[Tensor, "4 4"]:
-    """T_camera_lidar. Source: the data set's calibration, as in pyLiDAR-SLAM and KISS-ICP."""
-    R = torch.from_numpy(Rotation.from_quat([0.0, 0.0, 0.924, 0.383]).as_matrix())
-    return se3.from_rotation_translation(R, torch.tensor([-0.084, -0.025, 0.050], dtype=torch.float64))
-
-
-T_CAMERA_LIDAR = _left_camera_to_lidar()
+# Of the left camera. Source: the data set's calibration, as in pyLiDAR-SLAM and KISS-ICP.
+T_CAMERA_LIDAR = se3.from_rotation_translation(
+    torch.from_numpy(Rotation.from_quat([0.0, 0.0, 0.924, 0.383]).as_matrix()),
+    torch.tensor([-0.084, -0.025, 0.050], dtype=torch.float64),
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

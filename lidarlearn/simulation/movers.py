@@ -51,6 +51,5 @@ class Mover:
 
 def snapshot(movers: Sequence[Mover], time: float, centre: Float[np.ndarray, "3"], radius: float) -> list[Mesh]:
     """The meshes of all movers within `radius` [m] of a point at a time [s]."""
-    positions = ((mover, mover.position(time)) for mover in movers)
-    near = [mover for mover, at in positions if at is not None and np.linalg.norm(at - centre) < radius]
+    near = (m for m in movers if (at := m.position(time)) is not None and np.linalg.norm(at - centre) < radius)
     return [mesh for mover in near if (mesh := mover.at(time)) is not None]

@@ -88,8 +88,7 @@ def _signs(site: Site, street: Street, side: int) -> None:
     for spot in site.spots(street, side, 0.7, (20.0, 34.0)):
         site.place(objects.lamp(rng), spot.xy, spot.facing, (0.4, 0.4), 0.3)
     for spot in site.spots(street, side, 0.8, (15.0, 50.0)):
-        kind = rng.integers(3)
-        mesh = [objects.sign, objects.bollard, objects.bin_or_box][kind](rng)
+        mesh = [objects.sign, objects.bollard, objects.bin_or_box][rng.integers(3)](rng)
         site.place(mesh, spot.xy, spot.along, (0.6, 0.6), 0.3)
 
 
