@@ -14,9 +14,9 @@ from lidarlearn.data.export.formats import exporter_of
 from lidarlearn.data.sequence import Scan, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl32_inverted, hdl64
+from tests import scenes
 from tests.data.writers import curve, kitti_rows, random_points, write_float32
 from tests.odometry.odometries import build, motion_errors, poses
 

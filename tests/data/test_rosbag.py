@@ -19,9 +19,9 @@ from lidarlearn.data.cache import cached_vertex_maps
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import os1_64
+from tests import scenes
 from tests.data.bags import KINDS, OUSTER, PLAIN, TIMES_NS, details, first_coordinate, plain, rosbag
 from tests.data.test_pose_files import tum_rows
 from tests.data.writers import as_rows, curve, kitti_rows, random_points, write_bag

@@ -14,9 +14,9 @@ from lidarlearn.data.range_images import image_path
 from lidarlearn.data.simulated import SimulatedDataSet
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.sensors import hdl64
 from lidarlearn.simulation.worlds import PRESETS, build_world
+from tests import scenes
 
 
 @pytest.fixture(autouse=True, scope="module")

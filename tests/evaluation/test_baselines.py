@@ -7,9 +7,9 @@ import torch
 
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import hdl64
+from tests import scenes
 from tests.odometry.odometries import build, motion_errors, poses
 
 PACKAGES = {"kiss_icp": "kiss-icp", "small_gicp": "small_gicp"}

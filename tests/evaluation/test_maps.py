@@ -12,9 +12,10 @@ from lidarlearn.errors import UserError
 from lidarlearn.evaluation.maps import MapSettings, build_map, mean_plane_variance, moments
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.voxels import voxel_cells
-from lidarlearn.simulation import raycasting, scenes
+from lidarlearn.simulation import raycasting
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import hdl64
+from tests import scenes
 from tests.evaluation.conftest import DriveWithoutScans
 
 FRAMES = 8

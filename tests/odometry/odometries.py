@@ -13,9 +13,9 @@ from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.evaluate import build_odometry, configured_method
 from lidarlearn.geometry import se3
 from lidarlearn.odometry.base import BaseOdometry, Frame
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl32, hdl64, os1_64, vlp16
+from tests import scenes
 
 ASSOCIATIONS = ("kd", "vh", "p")
 slow = pytest.mark.slow

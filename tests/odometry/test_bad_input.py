@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from lidarlearn.geometry import se3
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
+from tests import scenes
 from tests.odometry.odometries import (
     FRAMES,
     SMALL,

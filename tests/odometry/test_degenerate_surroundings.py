@@ -3,8 +3,8 @@
 import pytest
 
 from lidarlearn.geometry import se3
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
+from tests import scenes
 from tests.odometry.odometries import SENSORS, build, kd_at_least, poses, run, scans_of, slow
 
 

@@ -7,9 +7,9 @@ from torch import Tensor
 from lidarlearn.geometry import se3
 from lidarlearn.metrics.absolute import ape_rmse
 from lidarlearn.odometry.deskew import deskew
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor
+from tests import scenes
 from tests.odometry.odometries import ASSOCIATIONS, build, kd_at_least, motion_errors, poses, run, scans_of, street
 
 MOTION = se3.exp(torch.tensor([1.3, 0.1, -0.05, 0.01, -0.02, 0.09], dtype=torch.float64))

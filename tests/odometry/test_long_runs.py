@@ -11,9 +11,9 @@ from torch import Tensor
 
 from lidarlearn.geometry import se3
 from lidarlearn.odometry.base import BaseOdometry, Frame
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor
+from tests import scenes
 from tests.odometry.odometries import build, kd_at_least, scans_of
 
 TINY = Sensor("tiny", tuple(np.linspace(20, -25, 32).tolist()), 96)

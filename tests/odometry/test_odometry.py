@@ -19,9 +19,9 @@ from lidarlearn.odometry.initialization_only import InitializationOnly
 from lidarlearn.registration.association import KdTree
 from lidarlearn.registration.gauss_newton import GaussNewton
 from lidarlearn.registration.residuals import GeneralizedIcp
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor, hdl64
+from tests import scenes
 from tests.gpu import on_gpu
 from tests.odometry.odometries import (
     ASSOCIATIONS,

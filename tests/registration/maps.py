@@ -12,9 +12,9 @@ from lidarlearn.odometry.sampling import GridSampling, ImageSampling, Sampling
 from lidarlearn.registration.association import KdTree, Projective, VoxelHash
 from lidarlearn.registration.association.base import Association
 from lidarlearn.registration.association.voxel_map import neighbourhood_normals
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import hdl64
+from tests import scenes
 
 ASSOCIATIONS = ("kd", "vh", "p")
 _MAP_SCANS = 4

@@ -8,12 +8,12 @@ from scipy.spatial import cKDTree
 
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
-from lidarlearn.simulation import scenes
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.meshes import box, merge
 from lidarlearn.simulation.movers import Mover
 from lidarlearn.simulation.sensors import Sensor, hdl64
 from lidarlearn.simulation.worlds import PRESETS, World
+from tests import scenes
 
 SENSOR = hdl64(columns=256)
 CLEAN = Sensor("clean", tuple(np.linspace(20, -20, 24).tolist()), 360, 0.1, 0.1, 120.0, 0.0, 0.0, float("inf"))

@@ -1,4 +1,4 @@
-"""Small geometric worlds for tests of registration and odometry, and paths through them.
+"""Small geometric worlds, and paths through them.
 
 The sensor moves along x, 1.73 m above the floor z = 0. `Drive(scene, poses=straight_path(...))` makes the scans.
 """
