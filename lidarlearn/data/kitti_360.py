@@ -89,8 +89,7 @@ class Kitti360(DataSetOnDisk):
         stamps = self.require_file(name, scans.folder.parent / "timestamps.txt")
         truth = self._poses(name, stamps)
         if truth is not None:
-            times = read_timestamps(stamps, scans.numbers)
-            scans = scans.select(covered(name, times, truth.timestamps))
+            scans = scans.select(covered(name, read_timestamps(stamps, scans.numbers), truth.timestamps))
         scans = scans.first(self.max_frames)
         if not len(scans):
             raise DamagedFileError(self._poses_file(name), f"its poses belong to none of the scans of {name}")
