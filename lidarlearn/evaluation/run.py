@@ -110,9 +110,8 @@ def run_odometry(
 def read_export(export: Export, sequence: Sequence) -> tuple[Float[Tensor, "n 4 4"], dict[str, Any]]:
     """Poses of the LiDAR and the summary of an exported run."""
     poses = read_trajectory(export.kitti)
-    frame = sequence.reference_frame
     summary = json.loads(export.summary.read_text(encoding="utf-8"))
-    return to_lidar_frame(poses, frame, frame, sequence.T_reference_lidar), summary
+    return to_lidar_frame(poses, sequence.reference_frame, sequence), summary
 
 
 def summarize_health(records: Iterable[Health]) -> dict[str, float | int | None]:

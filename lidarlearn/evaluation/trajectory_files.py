@@ -71,7 +71,7 @@ def lidar_poses(
         TrajectoryError: no frame is stated, and they fit the ground truth far better as poses of the LiDAR.
     """
     reference = sequence.reference_frame
-    T_world_lidar = to_lidar_frame(T_world, stated or reference, reference, sequence.T_reference_lidar)
+    T_world_lidar = to_lidar_frame(T_world, stated or reference, sequence)
     T_true = sequence.T_world_lidar
     if stated is None and T_true is not None and len(T_true) == len(T_world) and bool(T_world.isfinite().all()):
         as_stated, as_lidar = (relative_translation_error(T, T_true) for T in (T_world_lidar, T_world))
@@ -84,28 +84,25 @@ def lidar_poses(
     return T_world_lidar
 
 
-def to_lidar_frame(
-    T_world: Float[Tensor, "n 4 4"], frame: str, reference_frame: str, T_reference_lidar: Float[Tensor, "4 4"]
-) -> Float[Tensor, "n 4 4"]:
+def to_lidar_frame(T_world: Float[Tensor, "n 4 4"], frame: str, sequence: Sequence) -> Float[Tensor, "n 4 4"]:
     """Convert poses of another frame to poses of the LiDAR.
 
     Args:
         T_world: absolute poses of `frame`; the first one is arbitrary.
         frame: e.g. "camera" or "lidar".
-        reference_frame: the frame of the data set's own poses, see `Sequence.reference_frame`.
-        T_reference_lidar: pose of the LiDAR in that frame, see `Sequence.T_reference_lidar`.
+        sequence: the sequence to which the poses belong.
 
     Raises:
         TrajectoryError: the data set does not define the frame.
     """
     if frame == "lidar":
         return T_world
-    if frame != reference_frame:
+    if frame != sequence.reference_frame:
         raise TrajectoryError(
             f"trajectories are said to be in the frame '{frame}', but this data set only relates the frames "
-            f"{' and '.join(sorted({'lidar', reference_frame}))}.\n  change: state one of these frames"
+            f"{' and '.join(sorted({'lidar', sequence.reference_frame}))}.\n  change: state one of these frames"
         )
-    return torch.linalg.inv(T_reference_lidar) @ T_world @ T_reference_lidar
+    return torch.linalg.inv(sequence.T_reference_lidar) @ T_world @ sequence.T_reference_lidar
 
 
 def to_reference_frame(

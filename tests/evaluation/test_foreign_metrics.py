@@ -23,7 +23,7 @@ def test_ten_trajectories_agree_with_kiss_icp_and_evo(tmp_path, make_sequence, T
     write_kitti_poses(tmp_path / "00.txt", T_world_camera)
 
     poses = read_trajectory(tmp_path / "00.txt", sequence.timestamps)
-    lidar = to_lidar_frame(poses, "camera", sequence.reference_frame, sequence.T_reference_lidar)
+    lidar = to_lidar_frame(poses, "camera", sequence)
     ours = score("other", lidar, sequence)
 
     estimate = poses.numpy()

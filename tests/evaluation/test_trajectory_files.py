@@ -13,7 +13,6 @@ from lidarlearn.evaluation.trajectory_files import (
     to_lidar_frame,
     to_reference_frame,
 )
-from lidarlearn.geometry import se3
 
 TIMES = 1.3e9 + 0.1 * torch.arange(30, dtype=torch.float64)
 
@@ -125,19 +124,20 @@ def test_a_missing_file_is_named(tmp_path):
         read_trajectory(tmp_path / "no.txt")
 
 
-def test_camera_and_lidar_frames(poses, T_camera_lidar):
+def test_camera_and_lidar_frames(poses, make_sequence, T_camera_lidar):
+    sequence = make_sequence("04", len(poses), T_camera_lidar)
     T_world_camera = to_reference_frame(poses, T_camera_lidar)
     forward = T_world_camera[1, :3, 3]
     assert forward[2] > 0.9 * forward.norm()  # the camera looks along z
-    back = to_lidar_frame(T_world_camera, "camera", "camera", T_camera_lidar)
+    back = to_lidar_frame(T_world_camera, "camera", sequence)
     assert torch.allclose(back, poses, atol=1e-10)
-    assert to_lidar_frame(poses, "lidar", "camera", T_camera_lidar) is poses
+    assert to_lidar_frame(poses, "lidar", sequence) is poses
 
 
 @pytest.mark.parametrize("frame", ["camera", "imu"])
-def test_a_frame_that_the_data_set_does_not_know_is_refused(poses, frame):
+def test_a_frame_that_the_data_set_does_not_know_is_refused(poses, make_sequence, frame):
     with pytest.raises(TrajectoryError, match=f"frame '{frame}'.* lidar"):
-        to_lidar_frame(poses, frame, "lidar", se3.identity())
+        to_lidar_frame(poses, frame, make_sequence("04", len(poses)))
 
 
 def test_poses_are_taken_to_be_in_the_frame_of_the_data_set_unless_they_fit_far_better_as_the_lidars(
