@@ -21,6 +21,8 @@ from benchmarks.report import column
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.data import compose_data_set
 from lidarlearn.commands.evaluate import build_odometry, configured_method
+from lidarlearn.data.sequence import Sequence
+from lidarlearn.errors import UserError
 from lidarlearn.metrics.absolute import ape_rmse
 from lidarlearn.metrics.relative import relative_errors
 from lidarlearn.simulation.drive import Drive
@@ -59,13 +61,19 @@ def runner(method: str, device: torch.device) -> Runner:
 
 def drives(kitti: Path | None, scans: int) -> dict[str, tuple[list[Tensor], Tensor]]:
     """Scans and true poses of a simulated drive and, if its folder is given, of KITTI 04."""
-    simulated = Drive("urban", seed=1, frames=scans, speed=12.0, static=True, sensor=hdl64())
-    found = {"simulated, static": ([s.points for s in track(simulated, "simulating")], simulated.T_world_lidar)}
+    found: dict[str, Sequence] = {
+        "simulated, static": Drive("urban", seed=1, frames=scans, speed=12.0, static=True, sensor=hdl64())
+    }
     if kitti is not None:
         overrides = ["data=kitti_00-08", f"data.root={kitti}", f"data.max_frames={scans}", "data.train_sequences=[]"]
-        sequence = compose_data_set(overrides).sequence("04")
-        found["KITTI 04"] = ([s.points for s in sequence], sequence.T_world_lidar)
-    return found  # type: ignore[return-value]
+        found["KITTI 04"] = compose_data_set(overrides).sequence("04")
+    return {name: _scans_and_truth(name, sequence) for name, sequence in found.items()}
+
+
+def _scans_and_truth(name: str, sequence: Sequence) -> tuple[list[Tensor], Tensor]:
+    if sequence.T_world_lidar is None:
+        raise UserError(f"{name}: no ground truth\n  change: add its poses to the folder of --kitti, or omit --kitti")
+    return [scan.points for scan in track(sequence, f"reading {name}", len(sequence))], sequence.T_world_lidar
 
 
 def measure(options: report.Options) -> list[Row]:

@@ -41,7 +41,7 @@ def fit_planes(covariances: Float[Tensor, "*batch 6"]) -> PlaneFit:
 def covariances_of(
     means: Float[Tensor, "*batch 3"], square_means: Float[Tensor, "*batch 6"]
 ) -> Float[Tensor, "*batch 6"]:
-    """Covariances from the means of x, y, z and of their products; components in the order of `fit_planes`."""
+    """Covariances [m^2] from the means of x, y, z [m] and of their products [m^2], in the order of `fit_planes`."""
     x, y, z = means.unbind(-1)
     return square_means - torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], dim=-1)
 
