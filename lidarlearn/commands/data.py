@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command, *overrides = rest or [""]
     console = Console(highlight=False, soft_wrap=True)
     wanted = {"check": ("data=",), "export": ("data=", "to=", "to.root=")}.get(command)
-    with readable_errors("evaluate", overrides):
+    with readable_errors("data", overrides):
         _require_folder(config_folder)
         if wanted is None or not all(any(o.startswith(w) for o in overrides) for w in wanted):
             console.print(f"{_USAGE}\ndata sets: {', '.join(data_groups(config_folder))}", markup=False)
@@ -127,7 +127,7 @@ def compose_data_set(overrides: Sequence[str], config_folder: str | None = None)
         place = quoted(f"file://{Path(config_folder).absolute().as_posix()}")
         search_path = [f"hydra.searchpath=[{place}]"]
     with initialize_config_dir(str(config_directory().absolute()), version_base="1.3"):
-        return instantiate(compose("evaluate", [*overrides, *search_path]).data)
+        return instantiate(compose("data", [*overrides, *search_path]).data)
 
 
 def data_groups(config_folder: str | None = None) -> list[str]:
