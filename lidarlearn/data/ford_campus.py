@@ -22,11 +22,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
-from torch import Tensor
 
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
@@ -99,9 +97,9 @@ class FordCampus(DataSetOnDisk):
         train_sequences: Names,
         val_sequences: Names,
         test_sequences: Names,
-        max_frames: int | None = None,
-        deskew: bool = False,
-        beam_correction_deg: float | int = 0.0,
+        max_frames: int | None,
+        deskew: bool,
+        beam_correction_deg: float | int,
         min_range_m: float | int = 8.0,
         T_vehicle_lidar_m_deg: Iterable[float | int] = (0, 0, 0, 0, 0, 0),
     ) -> None:
@@ -109,7 +107,8 @@ class FordCampus(DataSetOnDisk):
             root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
         )
         self.min_range_m = float(min_range_m)
-        self.T_vehicle_lidar = _from_degrees(np.array([list(T_vehicle_lidar_m_deg)], dtype=np.float64))[0]
+        x_y_z_m, roll_pitch_yaw_deg = np.array(list(T_vehicle_lidar_m_deg), dtype=np.float64).reshape(2, 1, 3)
+        self.T_vehicle_lidar = transforms_from_euler(x_y_z_m, np.radians(roll_pitch_yaw_deg))[0]
 
     def sequence(self, name: str) -> FordCampusSequence:
         """Open a drive; the first time reads every scan for its pose."""
@@ -127,7 +126,7 @@ class FordCampus(DataSetOnDisk):
         self.require_scans(name, scans, "Scan*.mat")
         warn_of_gaps(name, scans)
         stamped = read(name, scans)
-        T_world_vehicle = _from_degrees(np.concatenate([stamped[:, 1:4], np.degrees(stamped[:, 4:])], axis=1))
+        T_world_vehicle = transforms_from_euler(stamped[:, 1:4], stamped[:, 4:])
         return FordCampusSequence(
             name=name,
             scans=scans,
@@ -216,8 +215,3 @@ def _field(path: Path, scan: np.void, name: str, rows: int) -> NDArray[Any]:
     if values.ndim != 2 or values.shape[0] != rows:
         raise DamagedFileError(path, f"SCAN.{name} is {values.shape}, not ({rows}, n)")
     return values
-
-
-def _from_degrees(poses: NDArray[np.float64]) -> Float[Tensor, "n 4 4"]:
-    """Transforms of x, y, z [m], roll, pitch, yaw [deg] with R = Rz Ry Rx."""
-    return transforms_from_euler(poses[:, :3], np.radians(poses[:, 3:]))

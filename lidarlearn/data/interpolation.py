@@ -1,12 +1,14 @@
 """Interpolation of ground-truth poses, and which scans they cover."""
 
 import logging
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.geometry import se3
 
 _log = logging.getLogger(__name__)
@@ -31,17 +33,35 @@ def interpolate_poses(
 
 
 def covered(
-    name: str, timestamps: Float[Tensor, "n"], truth_timestamps: Float[Tensor, "m"], slack_s: float = 0.0
+    path: Path,
+    name: str,
+    timestamps: Float[Tensor, "n"],
+    truth_timestamps: Float[Tensor, "m"],
+    slack_s: float = 0.0,
 ) -> list[int]:
     """Indices of the scans within the time of the ground truth; warns of scans outside of it or in its gaps.
 
     Args:
+        path: of the ground truth.
         name: of the sequence.
-        timestamps: of the scans [s].
-        truth_timestamps: of the ground-truth poses [s], ascending, at least two.
+        timestamps: of the scans [s], at least one.
+        truth_timestamps: of the ground-truth poses [s], ascending.
         slack_s: how long before the first or after the last pose a scan may be [s].
+
+    Raises:
+        DamagedFileError: there is only one pose, or no scan is within the time of the poses.
     """
-    inside = (timestamps >= truth_timestamps[0] - slack_s) & (timestamps <= truth_timestamps[-1] + slack_s)
+    if len(truth_timestamps) < 2:
+        raise DamagedFileError(path, f"{len(truth_timestamps)} poses with a time, where at least two are needed")
+    first_s, last_s = truth_timestamps[0], truth_timestamps[-1]
+    inside = (timestamps >= first_s - slack_s) & (timestamps <= last_s + slack_s)
+    if not inside.any():
+        raise DamagedFileError(
+            path,
+            f"its times ({first_s:.3f} to {last_s:.3f} s) do not overlap with those of the scans of {name}"
+            f" ({timestamps.min():.3f} to {timestamps.max():.3f} s)",
+            "use the poses of this recording, on the same clock as its scans",
+        )
     if not inside.all():
         _log.warning("%s: %d scans before or after the ground truth are left out", name, int((~inside).sum()))
     after = torch.searchsorted(truth_timestamps, timestamps).clamp(1, len(truth_timestamps) - 1)

@@ -25,8 +25,7 @@ from lidarlearn.data.scan_files import (
     subfolders,
     warn_of_gaps,
 )
-from lidarlearn.data.sequence import LayoutReport, Names, Scan
-from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.data.sequence import LayoutReport, Scan
 
 _WITH_GROUND_TRUTH = tuple(f"{i:02d}" for i in range(11))
 
@@ -71,21 +70,6 @@ class KittiOdometry(DataSetOnDisk):
     digits = 2
     source = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php (velodyne, calibration, ground truth poses)"
     marker = "folder 'sequences'"
-
-    def __init__(
-        self,
-        root: str | Path,
-        projection: SphericalProjection,
-        train_sequences: Names,
-        val_sequences: Names,
-        test_sequences: Names,
-        max_frames: int | None = None,
-        deskew: bool = False,
-        beam_correction_deg: float | int = 0.205,
-    ) -> None:
-        super().__init__(
-            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
-        )
 
     def sequence(self, name: str) -> KittiOdometrySequence:
         """Open a sequence."""

@@ -29,8 +29,7 @@ from lidarlearn.data.pose_files import (
     require_finite,
 )
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders
-from lidarlearn.data.sequence import LayoutReport, Names
-from lidarlearn.geometry.projection import SphericalProjection
+from lidarlearn.data.sequence import LayoutReport
 
 _PREFIX, _SUFFIX = "2013_05_28_drive_", "_sync"
 
@@ -67,21 +66,6 @@ class Kitti360(DataSetOnDisk):
     source = "https://www.cvlibs.net/datasets/kitti-360/ (raw Velodyne scans, calibrations, vehicle poses)"
     marker = "folder data_3d_raw with drives"
 
-    def __init__(
-        self,
-        root: str | Path,
-        projection: SphericalProjection,
-        train_sequences: Names,
-        val_sequences: Names,
-        test_sequences: Names,
-        max_frames: int | None = None,
-        deskew: bool = True,
-        beam_correction_deg: float | int = 0.0,
-    ) -> None:
-        super().__init__(
-            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
-        )
-
     def sequence(self, name: str) -> Kitti360Sequence:
         """Open a drive; scans before its first and after its last pose are left out."""
         scans = self._scans(name)
@@ -89,10 +73,9 @@ class Kitti360(DataSetOnDisk):
         stamps = self.require_file(name, scans.folder.parent / "timestamps.txt")
         truth = self._poses(name, stamps)
         if truth is not None:
-            scans = scans.select(covered(name, read_timestamps(stamps, scans.numbers), truth.timestamps))
+            scan_times = read_timestamps(stamps, scans.numbers)
+            scans = scans.select(covered(self._poses_file(name), name, scan_times, truth.timestamps))
         scans = scans.first(self.max_frames)
-        if not len(scans):
-            raise DamagedFileError(self._poses_file(name), f"its poses belong to none of the scans of {name}")
         timestamps = read_timestamps(stamps, scans.numbers)
         return Kitti360Sequence(
             name=name,
@@ -145,8 +128,8 @@ class Kitti360(DataSetOnDisk):
             return None
         rows = read_numbers(path, columns=13)
         require_finite(path, rows)
-        if len(rows) < 2 or (np.diff(rows[:, 0]) <= 0).any():
-            raise DamagedFileError(path, "fewer than two poses, or scan numbers that do not ascend")
+        if (np.diff(rows[:, 0]) <= 0).any():
+            raise DamagedFileError(path, "scan numbers that do not ascend")
         times = read_timestamps(stamps, rows[:, 0].astype(int).tolist())
         return StampedPoses(times, as_transforms(torch.from_numpy(rows[:, 1:]).reshape(-1, 3, 4)))
 

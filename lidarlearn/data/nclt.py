@@ -85,9 +85,9 @@ class Nclt(DataSetOnDisk):
         train_sequences: Names,
         val_sequences: Names,
         test_sequences: Names,
-        max_frames: int | None = None,
-        deskew: bool = False,
-        beam_correction_deg: float | int = 0.0,
+        max_frames: int | None,
+        deskew: bool,
+        beam_correction_deg: float | int,
         sensor_height_m: float | int = 1.03,
     ) -> None:
         super().__init__(
@@ -102,13 +102,11 @@ class Nclt(DataSetOnDisk):
         self.refuse_deskew()
         scans = self._scans(name)
         self.require_scans(name, scans, "*.bin")
-        ground_truth = self._ground_truth_file(name)
-        truth = None if ground_truth is None else read_ground_truth(ground_truth)
-        if truth is not None:
-            scans = scans.select(covered(name, _timestamps(scans), truth.timestamps))
+        truth, truth_file = None, self._truth_file(name)
+        if truth_file is not None:
+            truth = read_ground_truth(truth_file)
+            scans = scans.select(covered(truth_file, name, _timestamps(scans), truth.timestamps))
         scans = scans.first(self.max_frames)
-        if ground_truth is not None and not len(scans):
-            raise DamagedFileError(ground_truth, f"its times do not overlap with those of the scans of {name}")
         timestamps = _timestamps(scans)
         return NcltSequence(
             name=name,
@@ -136,18 +134,18 @@ class Nclt(DataSetOnDisk):
         scans = self._scans(name)
         layout.describe_scans(report, name, scans, POINT.itemsize)
         note = report.missing if name in self.test_sequences else report.odd
-        ground_truth = self._ground_truth_file(name)
-        if ground_truth is None:
+        truth_file = self._truth_file(name)
+        if truth_file is None:
             note(name, f"no ground truth: no groundtruth_{name}.csv in {name} or ground_truth")
-        elif ground_truth.stat().st_size == 0:
-            report.missing(name, f"empty ground truth: {ground_truth}")
+        elif truth_file.stat().st_size == 0:
+            report.missing(name, f"empty ground truth: {truth_file}")
         else:
-            report.found(name, f"ground truth in {ground_truth.relative_to(self.root)}")
+            report.found(name, f"ground truth in {truth_file.relative_to(self.root)}")
 
     def _scans(self, name: str) -> ScanFiles:
         return list_scans(self.root / name / "velodyne_sync", (".bin",), r"\d+", "1326030975726043.bin")
 
-    def _ground_truth_file(self, name: str) -> Path | None:
+    def _truth_file(self, name: str) -> Path | None:
         candidates = (folder / f"groundtruth_{name}.csv" for folder in (self.root / name, self.root / "ground_truth"))
         return next((path for path in candidates if path.is_file()), None)
 

@@ -18,14 +18,12 @@ from torch import Tensor
 from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.cloud_files import note_returns, read_cloud
-from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import StampedPoses, read_numbers, stamped_poses
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders
-from lidarlearn.data.sequence import LayoutReport, Names, Scan
+from lidarlearn.data.sequence import LayoutReport, Scan
 from lidarlearn.geometry import se3
-from lidarlearn.geometry.projection import SphericalProjection
 
 BEAMS, COLUMNS = 64, 1024
 PERIOD_S = 0.1
@@ -78,21 +76,6 @@ class NewerCollege(DataSetOnDisk):
     source = "https://ori-drs.github.io/newer-college-dataset/ (2020 release: ouster_scan and ground_truth of a walk)"
     marker = "folder like 01_short_experiment with raw_format/ouster_scan in it"
 
-    def __init__(
-        self,
-        root: str | Path,
-        projection: SphericalProjection,
-        train_sequences: Names,
-        val_sequences: Names,
-        test_sequences: Names,
-        max_frames: int | None = None,
-        deskew: bool = True,
-        beam_correction_deg: float | int = 0.0,
-    ) -> None:
-        super().__init__(
-            root, projection, train_sequences, val_sequences, test_sequences, max_frames, deskew, beam_correction_deg
-        )
-
     def sequence(self, name: str) -> NewerCollegeSequence:
         """Open a walk; scans before and after its ground truth are left out."""
         scans = _scans(self.root / name)
@@ -100,10 +83,8 @@ class NewerCollege(DataSetOnDisk):
         truth_file = self._truth_file(name)
         truth = read_registered_poses(truth_file) if truth_file.is_file() else None
         if truth is not None:
-            scans = scans.select(covered(name, _middles(scans), truth.timestamps))
+            scans = scans.select(covered(truth_file, name, _middles(scans), truth.timestamps))
         scans = scans.first(self.max_frames)
-        if not len(scans):
-            raise DamagedFileError(truth_file, f"its times do not overlap with those of the scans of {name}")
         timestamps = _middles(scans)
         return NewerCollegeSequence(
             name=name,
@@ -146,11 +127,9 @@ def read_registered_poses(path: Path) -> StampedPoses:
     """Read the left camera's poses from rows of `sec, nsec, x, y, z, qx, qy, qz, qw` [s, ns, m].
 
     Raises:
-        DamagedFileError: not such a file, fewer than two rows, or times that do not ascend.
+        DamagedFileError: not such a file, or times that do not ascend.
     """
     rows = read_numbers(path, columns=9, delimiter=",")
-    if len(rows) < 2:
-        raise DamagedFileError(path, f"{len(rows)} rows, at least two are needed")
     return stamped_poses(path, np.column_stack([rows[:, 0] + 1e-9 * rows[:, 1], rows[:, 2:]]))
 
 

@@ -151,8 +151,8 @@ class LayoutReport:
 class DataSet(ABC):
     """A data set on disk: opens sequences by name, and divides them into training, validation and test sequences.
 
-    The constructors of all data sets take the arguments below, so that a setting means the same for each of them;
-    `configs/data/<name>.yaml` holds their values.
+    The constructors of all data sets take the arguments below, so that a setting means the same for each of them. Their
+    values differ: `configs/data/<name>.yaml` holds those of each data set.
 
     Attributes:
         title: of the data set, as its authors call it.

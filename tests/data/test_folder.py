@@ -182,7 +182,7 @@ def test_clocks_that_do_not_agree(tmp_path):
     write_scans(tmp_path / "drive")
     (tmp_path / "drive" / "poses.tum").write_text(tum_rows(curve(3), [5.0, 6.0, 7.0]))
     (tmp_path / "drive" / "times.txt").write_text("0.2\n0.5\n0.8\n")
-    with pytest.raises(DamagedFileError, match="do not cover"):
+    with pytest.raises(DamagedFileError, match="do not overlap"):
         folder(tmp_path).sequence("drive")
 
 

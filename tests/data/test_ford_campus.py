@@ -8,13 +8,14 @@ from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.ford_campus import FordCampus
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.settings import settings_of
 from tests.data.writers import write_ford_campus
 
 NAME = "IJRR-Dataset-1"
 
 
 def ford(root, **settings):
-    return FordCampus(root, SphericalProjection(), [NAME], [NAME], [NAME], **settings)
+    return FordCampus(root, SphericalProjection(), [NAME], [NAME], [NAME], **(settings_of("ford_campus") | settings))
 
 
 def scan_file(root, number=76):

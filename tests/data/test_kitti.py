@@ -10,12 +10,13 @@ from lidarlearn.data.kitti import KittiOdometry
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.settings import settings_of
 from tests.data.writers import T_CAMERA_LIDAR, kitti_rows, write_kitti_odometry
 
 
 def kitti(root, **settings):
     splits = {"train_sequences": ["04"], "val_sequences": ["04"], "test_sequences": ["04"]}
-    return KittiOdometry(root, SphericalProjection(), **(splits | settings))
+    return KittiOdometry(root, SphericalProjection(), **(settings_of("base/kitti_odometry") | splits | settings))
 
 
 def details(report, level):

@@ -5,13 +5,14 @@ import torch
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.kitti_360 import Kitti360
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.settings import settings_of
 from tests.data.writers import relative_to_first, write_kitti_360
 
 DRIVE = "2013_05_28_drive_0003_sync"
 
 
 def kitti_360(root, name="0003", **settings):
-    return Kitti360(root, SphericalProjection(), [name], [name], [name], **settings)
+    return Kitti360(root, SphericalProjection(), [name], [name], [name], **(settings_of("kitti_360") | settings))
 
 
 def poses_file(root):
@@ -65,6 +66,7 @@ def test_without_ground_truth(tmp_path):
         ("0 " + "nan " * 12 + "\n1 " + "1 " * 12, "not finite"),
         ("1 " + "1 " * 12 + "\n0 " + "1 " * 12, "do not ascend"),
         ("0 " + "1 " * 12 + "\n99 " + "1 " * 12, "too few for frame 99"),
+        ("3 " + "1 " * 12 + "\n", "at least two"),
     ],
 )
 def test_damaged_poses(tmp_path, content, problem):

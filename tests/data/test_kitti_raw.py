@@ -12,13 +12,14 @@ from lidarlearn.geometry.voxels import grid_sample
 from lidarlearn.odometry.deskew import deskew
 from lidarlearn.registration.association.kdtree import KdTree
 from lidarlearn.registration.gauss_newton import GaussNewton
+from tests.data.settings import settings_of
 from tests.data.writers import write_kitti_raw
 
 DRIVE = "2011_09_26_drive_0009"
 
 
 def raw(root, name=DRIVE, **settings):
-    return KittiRaw(root, SphericalProjection(), [name], [name], [name], **settings)
+    return KittiRaw(root, SphericalProjection(), [name], [name], [name], **(settings_of("kitti_raw") | settings))
 
 
 def folder(root):

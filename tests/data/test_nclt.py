@@ -6,12 +6,14 @@ from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.nclt import POINT, Nclt
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.settings import settings_of
 from tests.data.writers import relative_to_first, write_nclt
 
 DATE = "2012-01-08"
 
 
 def nclt(root, name=DATE, **settings):
+    settings = settings_of("nclt") | settings
     return Nclt(root, SphericalProjection(32, 720, 31.3, -11.3), [name], [name], [name], **settings)
 
 

@@ -5,12 +5,14 @@ import torch
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.newer_college import NewerCollege
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.settings import settings_of
 from tests.data.writers import write_newer_college
 
 WALK = "01_short_experiment"
 
 
 def newer_college(root, **settings):
+    settings = settings_of("newer_college") | settings
     return NewerCollege(root, SphericalProjection(), [WALK], [WALK], [WALK], **settings)
 
 

@@ -119,7 +119,7 @@ def test_clouds_that_the_ground_truth_does_not_cover_are_left_out(tmp_path, kind
     assert "those outside are left" in details(rosbag(tmp_path).check(), "odd")
     for times in ([5, 6, 7], [-7, -6, -5]):
         truth.write_text(tum_rows(curve(3), times))
-        with pytest.raises(DamagedFileError, match=r"do not cover(.|\n)*one clock"):
+        with pytest.raises(DamagedFileError, match=r"do not overlap(.|\n)*the same clock"):
             rosbag(tmp_path).sequence("street")
         report = rosbag(tmp_path).check()
         assert not report.usable and "use one clock" in details(report, "missing")
