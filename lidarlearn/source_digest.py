@@ -33,21 +33,34 @@ def source_digest(*origins: Origin, within: Path = PACKAGE) -> str:
         within: imports of files of this package are followed only below this folder.
     """
     digest = hashlib.sha256()
-    for path, tree in sorted(_with_imports(origins, within).items(), key=lambda file: file[0]):
+    for path, syntax in sorted(_with_imports(origins, within).items()):
         name = path.relative_to(PACKAGE).as_posix() if path.is_relative_to(PACKAGE) else path.name
-        digest.update(name.encode() + b"\0" + ast.dump(_without_docstrings(tree)).encode() + b"\0")
+        digest.update(name.encode() + b"\0" + syntax + b"\0")
     return digest.hexdigest()[:12]
 
 
-def _with_imports(origins: Iterable[Origin], within: Path) -> dict[Path, ast.Module]:
-    found: dict[Path, ast.Module] = {}
+def _with_imports(origins: Iterable[Origin], within: Path) -> dict[Path, bytes]:
+    """The syntax of every source file, see `_syntax`."""
+    found: dict[Path, bytes] = {}
     ahead = [source for origin in origins for source in _sources(origin)]
     while ahead:
         path, cell = ahead.pop()
         if path not in found:
-            found[path] = _parsed(path.read_bytes() if cell is None else cell)
-            ahead += [(file, None) for file in _imports(path, found[path]) if _followed(file, within)]
+            found[path], imports = _syntax(path.read_bytes() if cell is None else cell)
+            ahead += [(file, None) for file in _imports(path, imports) if _followed(file, within)]
     return found
+
+
+@cache  # several digests share most of their files
+def _syntax(source: bytes) -> tuple[bytes, list[ast.Import | ast.ImportFrom]]:
+    """The syntax of a source without its docstrings, in bytes, and its imports at any place."""
+    tree = _parsed(source)
+    nodes = list(ast.walk(tree))
+    for node in nodes:
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            if ast.get_docstring(node, clean=False) is not None:
+                del node.body[0]
+    return ast.dump(tree).encode(), [node for node in nodes if isinstance(node, (ast.Import, ast.ImportFrom))]
 
 
 def _sources(origin: Origin) -> Iterator[tuple[Path, bytes | None]]:
@@ -91,17 +104,15 @@ def _followed(file: Path, within: Path) -> bool:
     return not file.is_relative_to(_STANDARD_LIBRARY) and {"site-packages", "dist-packages"}.isdisjoint(file.parts)
 
 
-def _imports(path: Path, tree: ast.Module) -> Iterator[Path]:
-    """The files of the modules that a file imports, at any place in it."""
-    for node in ast.walk(tree):
+def _imports(path: Path, nodes: Iterable[ast.Import | ast.ImportFrom]) -> Iterator[Path]:
+    """The files of the modules that a file imports."""
+    for node in nodes:
         if isinstance(node, ast.Import):
             folders, names = _import_folders(path), [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):  # only the disk tells whether an imported name is a module
+        else:  # only the disk tells whether an imported name is a module
             folders = [path.parents[node.level - 1]] if node.level else _import_folders(path)
             start = [node.module] if node.module else []
             names = [".".join(start), *(".".join([*start, alias.name]) for alias in node.names)]
-        else:
-            continue
         for name in names:
             modules = [folder.joinpath(*name.split(".")) for folder in folders]
             files = (file for module in modules for file in (module / "__init__.py", module.with_suffix(".py")))
@@ -114,12 +125,3 @@ def _import_folders(path: Path) -> list[Path]:
         return [PACKAGE.parent]
     beside = next(folder for folder in path.parents if not (folder / "__init__.py").is_file())
     return [beside, *(Path(entry).resolve() for entry in sys.path), PACKAGE.parent]
-
-
-def _without_docstrings(tree: ast.Module) -> ast.Module:
-    """Remove all docstrings from the tree, in place."""
-    for node in ast.walk(tree):
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
-            if ast.get_docstring(node, clean=False) is not None:
-                del node.body[0]
-    return tree
