@@ -3,6 +3,8 @@
 The sensor moves along x, 1.73 m above the floor z = 0. `Drive(scene, poses=straight_path(...))` makes the scans.
 """
 
+from functools import cache
+
 import numpy as np
 from jaxtyping import Float
 
@@ -50,6 +52,7 @@ def tunnel(radius: float = 5.0, length: float = 1000.0) -> World:
     return World(merge([box(length, 2 * radius, 1.0, base=-1.0), sheet(ends[:, None] + arch)]))
 
 
+@cache
 def street(seed: int = 0, length: float = 200.0) -> World:
     """A straight street on a plane, from x = -50 on, with houses, trees, lamps and parked cars."""
     rng = np.random.default_rng(seed)

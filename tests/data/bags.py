@@ -28,9 +28,5 @@ def plain(count=3, first=0):
     return [as_rows(random_points(first + i), PLAIN) for i in range(count)]
 
 
-def details(report, level):
-    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
-
-
 def first_coordinate(sequence, index):
     return float(sequence.scan(index).points[0, 0])

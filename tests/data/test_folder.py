@@ -5,8 +5,8 @@ from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.folder import Folder
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
-from tests.data.test_pose_files import tum_rows
-from tests.data.writers import as_rows, curve, kitti_rows, random_points, write_float32, write_pcd
+from tests.data.datasets import findings
+from tests.data.writers import as_rows, curve, kitti_rows, random_points, tum_rows, write_float32, write_pcd
 
 TIMES = np.linspace(0, 99_000_000, 200).astype(np.uint32)
 
@@ -18,10 +18,6 @@ def folder(root, **settings):
 def write_scans(directory, names=("1.bin", "2.bin", "10.bin")):
     for i, name in enumerate(names):
         write_float32(directory / name, random_points(i))
-
-
-def details(report, level):
-    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
 
 
 def test_every_subfolder_is_a_sequence(tmp_path):
@@ -39,13 +35,13 @@ def test_scans_beside_folders_of_scans_are_not_left_out_in_silence(tmp_path, cap
     write_scans(tmp_path / "drive" / "maps", ["GlobalMap.bin"])
     data = folder(tmp_path / "drive")
     assert data.names == ("maps",) and len(data.sequences(["maps"])) == 1
-    for text in (details(data.check(), "odd"), caplog.text):
+    for text in (findings(data.check(), "odd"), caplog.text):
         assert f"3 scans in {tmp_path / 'drive'} itself are left out" in text
         assert "'data.test_sequences=[\"drive\"]' reads them" in text
     caplog.clear()
     chosen = folder(tmp_path / "drive", test_sequences=["drive"])
     assert len(chosen.sequences(["drive"])["drive"]) == 3
-    assert "left out" not in details(chosen.check(), "odd") + caplog.text
+    assert "left out" not in findings(chosen.check(), "odd") + caplog.text
 
 
 def test_a_folder_given_by_dots_has_its_own_name(tmp_path, monkeypatch):
@@ -109,10 +105,10 @@ def test_points_off_the_image_may_be_read_in_wrong_columns(tmp_path):
     np.column_stack([points, np.ones(200), np.arange(200) % 32]).astype("<f4").tofile(tmp_path / "bin" / "0.pcd.bin")
     (tmp_path / "npy").mkdir()
     np.save(tmp_path / "npy" / "0.npy", points[:, [0, 2, 1]])
-    odd = details(folder(tmp_path).check(), "odd").split(" | ")
+    odd = findings(folder(tmp_path).check(), "odd").split(" | ")
     of_bin, of_npy = (line for line in odd if "outside the image" in line)
     assert "data.bin_columns where these files do not have 4 numbers" in of_bin and "bin_columns" not in of_npy
-    assert "outside the image" not in details(folder(tmp_path / "bin", bin_columns=5).check(), "odd")
+    assert "outside the image" not in findings(folder(tmp_path / "bin", bin_columns=5).check(), "odd")
 
 
 def test_deskewing_needs_point_times(tmp_path):
@@ -126,7 +122,7 @@ def test_deskewing_needs_point_times(tmp_path):
         with pytest.raises(UserError, match=r"data\.deskew=false"):
             folder(tmp_path, deskew=True).sequence(name)
     report = folder(tmp_path, deskew=True).check()
-    assert not report.usable and "without" in details(report, "missing")
+    assert not report.usable and "without" in findings(report, "missing")
 
 
 @pytest.mark.parametrize("name", ["drive/poses.txt", "drive/groundtruth.txt", "drive.txt"])
@@ -227,12 +223,12 @@ def test_of_many_sequences_a_few_are_named(tmp_path):
 def test_check(tmp_path):
     write_scans(tmp_path / "drive")
     report = folder(tmp_path).check()
-    assert report.usable and "no ground truth" in details(report, "odd")
+    assert report.usable and "no ground truth" in findings(report, "odd")
     (tmp_path / "drive.txt").write_text(kitti_rows(curve(3)))
-    assert "with 3 rows" in details(folder(tmp_path).check(), "found")
+    assert "with 3 rows" in findings(folder(tmp_path).check(), "found")
     (tmp_path / "drive" / "2.bin").write_bytes(b"x" * 17)
     report = folder(tmp_path).check()
-    assert not report.usable and "2.bin (17 bytes)" in details(report, "missing")
+    assert not report.usable and "2.bin (17 bytes)" in findings(report, "missing")
 
 
 def test_fingerprint_follows_the_settings(tmp_path):

@@ -8,6 +8,7 @@ from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.ford_campus import FordCampus
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.datasets import findings
 from tests.data.settings import settings_of
 from tests.data.writers import write_ford_campus
 
@@ -20,10 +21,6 @@ def ford(root, **settings):
 
 def scan_file(root, number=76):
     return root / NAME / "SCANS" / f"Scan{number:04d}.mat"
-
-
-def details(report, level):
-    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
 
 
 def test_round_trip(tmp_path):
@@ -89,7 +86,7 @@ def test_an_empty_scan_is_found_by_the_check(tmp_path):
     write_ford_campus(tmp_path)
     scan_file(tmp_path).write_bytes(b"")
     report = ford(tmp_path).check()
-    assert not report.usable and "Scan0076.mat (0 bytes)" in details(report, "missing")
+    assert not report.usable and "Scan0076.mat (0 bytes)" in findings(report, "missing")
 
 
 @pytest.mark.parametrize(
@@ -139,8 +136,8 @@ def test_further_sequences_and_gaps_are_listed(tmp_path):
     scan_file(tmp_path).unlink()
     report = ford(tmp_path).check()
     assert report.usable
-    assert "IJRR-Dataset-2 there (4 files), but not among" in details(report, "found")
-    assert "gaps in the numbering: 76" in details(report, "odd")
+    assert "IJRR-Dataset-2 there (4 files), but not among" in findings(report, "found")
+    assert "gaps in the numbering: 76" in findings(report, "odd")
 
 
 def test_check_reads_one_scan_and_keeps_no_poses(tmp_path, monkeypatch):
@@ -152,7 +149,7 @@ def test_check_reads_one_scan_and_keeps_no_poses(tmp_path, monkeypatch):
     assert set(reads) == {scan_file(tmp_path, 75)}
     assert not (tmp_path / NAME / "lidarlearn_poses.npz").exists()
     savemat(scan_file(tmp_path, 75), {"OTHER": np.random.default_rng(0).normal(size=1000)})
-    assert "no MATLAB file with a structure SCAN" in details(ford(tmp_path).check(), "missing")
+    assert "no MATLAB file with a structure SCAN" in findings(ford(tmp_path).check(), "missing")
 
 
 def test_deskewing_compensated_scans_is_refused(tmp_path):

@@ -10,6 +10,7 @@ from lidarlearn.data.kitti import KittiOdometry
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.datasets import findings
 from tests.data.settings import settings_of
 from tests.data.writers import T_CAMERA_LIDAR, kitti_rows, write_kitti_odometry
 
@@ -17,10 +18,6 @@ from tests.data.writers import T_CAMERA_LIDAR, kitti_rows, write_kitti_odometry
 def kitti(root, **settings):
     splits = {"train_sequences": ["04"], "val_sequences": ["04"], "test_sequences": ["04"]}
     return KittiOdometry(root, SphericalProjection(), **(settings_of("base/kitti_odometry") | splits | settings))
-
-
-def details(report, level):
-    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
 
 
 def test_round_trip(tmp_path):
@@ -76,7 +73,7 @@ def test_a_gap_is_logged_and_found_odd(tmp_path, caplog):
     assert len(kitti(tmp_path).sequence("04")) == 4
     assert "1 gaps" in caplog.text
     report = kitti(tmp_path).check()
-    assert report.usable and "1 gaps in the numbering: 2" in details(report, "odd")
+    assert report.usable and "1 gaps in the numbering: 2" in findings(report, "odd")
 
 
 def test_without_poses_there_is_no_ground_truth(tmp_path):
@@ -84,7 +81,7 @@ def test_without_poses_there_is_no_ground_truth(tmp_path):
     (tmp_path / "poses/04.txt").unlink()
     assert kitti(tmp_path).sequence("04").T_world_lidar is None
     report = kitti(tmp_path).check()
-    assert not report.usable and "no poses" in details(report, "missing")
+    assert not report.usable and "no poses" in findings(report, "missing")
     assert kitti(tmp_path, test_sequences=[]).check().usable
 
 
@@ -114,7 +111,7 @@ def test_fewer_poses_than_scans(tmp_path):
     with pytest.raises(DamagedFileError, match=r"3 rows, too few for scan 000004\.bin"):
         kitti(tmp_path).sequence("04")
     report = kitti(tmp_path).check()
-    assert not report.usable and "3 poses in 04.txt, fewer than the 5" in details(report, "missing")
+    assert not report.usable and "3 poses in 04.txt, fewer than the 5" in findings(report, "missing")
 
 
 def test_a_nan_pose_and_an_empty_pose_file(tmp_path):
@@ -136,7 +133,7 @@ def test_a_truncated_scan(tmp_path):
     with pytest.raises(DamagedFileError, match=r"000003\.bin: truncated"):
         sequence.scan(3)
     report = kitti(tmp_path).check()
-    assert not report.usable and "000003.bin (3195 bytes)" in details(report, "missing")
+    assert not report.usable and "000003.bin (3195 bytes)" in findings(report, "missing")
 
 
 def test_a_small_scan_is_odd(tmp_path):
@@ -144,7 +141,7 @@ def test_a_small_scan_is_odd(tmp_path):
     path = tmp_path / "sequences/04/velodyne/000003.bin"
     path.write_bytes(path.read_bytes()[:160])
     report = kitti(tmp_path).check()
-    assert report.usable and "000003.bin (160 bytes)" in details(report, "odd")
+    assert report.usable and "000003.bin (160 bytes)" in findings(report, "odd")
 
 
 @pytest.mark.parametrize("calibration", ["", "P0: 1\n", "Tr: 1 2 3\n", "Tr: a\n"])
@@ -164,8 +161,8 @@ def test_deskewing_compensated_scans_is_refused(tmp_path):
 def test_check_lists_missing_and_further_sequences(tmp_path):
     write_kitti_odometry(tmp_path, "04")
     report = kitti(tmp_path, train_sequences=["00"], val_sequences=["00"], test_sequences=[9]).check()
-    assert "00 no folder" in details(report, "missing") and "09 no folder" in details(report, "missing")
-    assert "04 there (5 files), but not among" in details(report, "found")
+    assert "00 no folder" in findings(report, "missing") and "09 no folder" in findings(report, "missing")
+    assert "04 there (5 files), but not among" in findings(report, "found")
     assert "(04)" in report.remedy
 
 
@@ -176,8 +173,8 @@ def test_check_looks_at_names_and_sizes_only(tmp_path, monkeypatch):
         (folder / f"{i:06d}.bin").touch()
     monkeypatch.setattr("pathlib.Path.read_bytes", lambda path: pytest.fail(f"opened {path}"))
     report = kitti(tmp_path, train_sequences=["00"], val_sequences=[], test_sequences=[]).check()
-    assert "1000 scans" in details(report, "found")
-    assert "1000 empty or truncated" in details(report, "missing")
+    assert "1000 scans" in findings(report, "found")
+    assert "1000 empty or truncated" in findings(report, "missing")
 
 
 def test_only_kitti_s_own_names_are_scans(tmp_path):
@@ -189,8 +186,8 @@ def test_only_kitti_s_own_names_are_scans(tmp_path):
     assert sequence.scans.numbers == [0, 1, 2, 3, 4]
     assert np.allclose(sequence.T_world_lidar, written.T_world_lidar, atol=1e-9)
     report = kitti(tmp_path).check()
-    assert report.usable and "3 files that are not named like scans" in details(report, "odd")
-    assert "'0000003.bin', '000002 (1).bin', 'scan.bin'" in details(report, "odd")
+    assert report.usable and "3 files that are not named like scans" in findings(report, "odd")
+    assert "'0000003.bin', '000002 (1).bin', 'scan.bin'" in findings(report, "odd")
 
 
 def test_an_absent_sequence_says_what_is_there_and_which_setting_names_it(tmp_path):
@@ -216,13 +213,13 @@ def test_check_opens_what_looks_whole(tmp_path, file, content, problem):
     with pytest.raises(DamagedFileError, match=problem):
         kitti(tmp_path).sequence("04")
     report = kitti(tmp_path).check()
-    assert not report.usable and problem in details(report, "missing")
+    assert not report.usable and problem in findings(report, "missing")
 
 
 def test_check_knows_that_nothing_is_to_deskew(tmp_path):
     write_kitti_odometry(tmp_path)
     report = kitti(tmp_path, deskew=True).check()
-    assert not report.usable and "data.deskew=false" in details(report, "missing")
+    assert not report.usable and "data.deskew=false" in findings(report, "missing")
 
 
 @pytest.mark.realdata
@@ -237,4 +234,4 @@ def test_genuine_sequence_04(real_data):
     ground = scan.points[(scan.points[:, :2].norm(dim=1) < 10) & (scan.points[:, 2] < -1)]
     assert ground[:, 2].median() == pytest.approx(-1.7, abs=0.15)
     report = kitti(real_data / "kitti_odometry").check()
-    assert report.usable and "271 poses, of which the scans need the first 51" in details(report, "found")
+    assert report.usable and "271 poses, of which the scans need the first 51" in findings(report, "found")

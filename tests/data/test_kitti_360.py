@@ -5,6 +5,7 @@ import torch
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.kitti_360 import Kitti360
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.datasets import findings
 from tests.data.settings import settings_of
 from tests.data.writers import relative_to_first, write_kitti_360
 
@@ -17,10 +18,6 @@ def kitti_360(root, name="0003", **settings):
 
 def poses_file(root):
     return root / "data_poses" / DRIVE / "poses.txt"
-
-
-def details(report, level):
-    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
 
 
 def test_round_trip(tmp_path):
@@ -55,7 +52,7 @@ def test_without_ground_truth(tmp_path):
     poses_file(tmp_path).unlink()
     sequence = kitti_360(tmp_path).sequence("0003")
     assert sequence.T_world_lidar is None and len(sequence) == 6
-    assert "no ground truth" in details(kitti_360(tmp_path).check(), "missing")
+    assert "no ground truth" in findings(kitti_360(tmp_path).check(), "missing")
 
 
 @pytest.mark.parametrize(
@@ -89,7 +86,7 @@ def test_a_truncated_scan(tmp_path):
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(DamagedFileError, match="truncated"):
         kitti_360(tmp_path).sequence("0003").scan(2)
-    assert "truncated" in details(kitti_360(tmp_path).check(), "missing")
+    assert "truncated" in findings(kitti_360(tmp_path).check(), "missing")
 
 
 def test_what_is_missing_is_named(tmp_path):
@@ -101,4 +98,4 @@ def test_what_is_missing_is_named(tmp_path):
     (tmp_path / "calibration" / "calib_cam_to_velo.txt").unlink()
     with pytest.raises(DataSetNotFoundError, match="calib_cam_to_velo"):
         kitti_360(tmp_path).sequence("0003")
-    assert "calib_cam_to_velo" in details(kitti_360(tmp_path).check(), "missing")
+    assert "calib_cam_to_velo" in findings(kitti_360(tmp_path).check(), "missing")

@@ -12,6 +12,7 @@ from lidarlearn.geometry.voxels import grid_sample
 from lidarlearn.odometry.deskew import deskew
 from lidarlearn.registration.association.kdtree import KdTree
 from lidarlearn.registration.gauss_newton import GaussNewton
+from tests.data.datasets import findings
 from tests.data.settings import settings_of
 from tests.data.writers import write_kitti_raw
 
@@ -24,10 +25,6 @@ def raw(root, name=DRIVE, **settings):
 
 def folder(root):
     return root / "2011_09_26" / f"{DRIVE}_sync"
-
-
-def details(report, level):
-    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
 
 
 def test_round_trip(tmp_path):
@@ -56,7 +53,7 @@ def test_dropped_scans_keep_their_numbers(tmp_path, caplog):
     assert len(sequence) == 4 and "1 gaps" in caplog.text
     assert np.allclose(sequence.T_world_lidar, written.T_world_lidar, atol=1e-4)
     report = raw(tmp_path).check()
-    assert report.usable and "gaps in the numbering: 2-3" in details(report, "odd")
+    assert report.usable and "gaps in the numbering: 2-3" in findings(report, "odd")
 
 
 def test_sweep_times_run_clockwise_from_the_rear():
@@ -92,7 +89,7 @@ def test_without_gps_there_is_no_ground_truth(tmp_path):
     (folder(tmp_path) / "oxts").rename(tmp_path / "elsewhere")
     assert raw(tmp_path).sequence(DRIVE).T_world_lidar is None
     report = raw(tmp_path).check()
-    assert not report.usable and "no ground truth" in details(report, "missing")
+    assert not report.usable and "no ground truth" in findings(report, "missing")
 
 
 @pytest.mark.parametrize(
@@ -163,7 +160,7 @@ def test_scans_without_packets_have_no_ground_truth_made_up(tmp_path, caplog):
     assert np.allclose(sequence.T_world_lidar, poses, atol=1e-4)
     assert len(raw(tmp_path, max_frames=3).sequence(DRIVE)) == 3
     report = raw(tmp_path).check()
-    assert report.usable and "10 GPS/IMU packets for scans numbered up to 19" in details(report, "odd")
+    assert report.usable and "10 GPS/IMU packets for scans numbered up to 19" in findings(report, "odd")
 
 
 def test_scans_in_a_hole_of_the_packets_are_told(tmp_path, caplog):
@@ -190,13 +187,13 @@ def test_files_of_other_names_are_no_scans_or_packets(tmp_path):
         file.with_stem(file.stem + "_copy").write_bytes(file.read_bytes())
     T = raw(tmp_path).sequence(DRIVE).T_world_lidar
     assert np.allclose(T, written.T_world_lidar, atol=1e-4)
-    assert "'0000000002_copy.bin'" in details(raw(tmp_path).check(), "odd")
+    assert "'0000000002_copy.bin'" in findings(raw(tmp_path).check(), "odd")
 
 
 def test_a_drive_of_kitti_odometry_is_found_under_its_number(tmp_path):
     write_kitti_raw(tmp_path, drive=ODOMETRY_DRIVES["04"].name)
     report = raw(tmp_path, name="04").check()
-    assert report.usable and "not among the configured" not in details(report, "found")
+    assert report.usable and "not among the configured" not in findings(report, "found")
 
 
 @pytest.mark.realdata

@@ -6,6 +6,7 @@ from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.nclt import POINT, Nclt
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.datasets import findings
 from tests.data.settings import settings_of
 from tests.data.writers import relative_to_first, write_nclt
 
@@ -19,10 +20,6 @@ def nclt(root, name=DATE, **settings):
 
 def truth_file(root):
     return root / DATE / f"groundtruth_{DATE}.csv"
-
-
-def details(report, level):
-    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
 
 
 @pytest.mark.parametrize("height", [0.0, 1.03])
@@ -81,7 +78,7 @@ def test_without_ground_truth(tmp_path):
     sequence = nclt(tmp_path).sequence(DATE)
     assert sequence.T_world_lidar is None and len(sequence) == 5
     report = nclt(tmp_path).check()
-    assert not report.usable and f"groundtruth_{DATE}.csv" in details(report, "missing")
+    assert not report.usable and f"groundtruth_{DATE}.csv" in findings(report, "missing")
 
 
 @pytest.mark.parametrize(
@@ -105,7 +102,7 @@ def test_an_empty_csv_is_found_by_the_check(tmp_path):
     write_nclt(tmp_path)
     truth_file(tmp_path).write_text("")
     report = nclt(tmp_path).check()
-    assert not report.usable and "empty ground truth" in details(report, "missing")
+    assert not report.usable and "empty ground truth" in findings(report, "missing")
 
 
 def test_a_truncated_scan(tmp_path):
@@ -115,7 +112,7 @@ def test_a_truncated_scan(tmp_path):
     with pytest.raises(DamagedFileError, match=r"truncated.*8 bytes"):
         nclt(tmp_path).sequence(DATE).scan(2)
     report = nclt(tmp_path).check()
-    assert not report.usable and path.name in details(report, "missing")
+    assert not report.usable and path.name in findings(report, "missing")
 
 
 @pytest.mark.parametrize("gone", [f"{DATE}/velodyne_sync", DATE])
@@ -155,4 +152,4 @@ def test_the_genuine_scan(real_data):
     elevation = np.degrees(np.arctan2(points[:, 2].numpy(), points[:, :2].norm(dim=1).numpy()))
     medians = sorted(np.median(elevation[rows["laser"] == laser]) for laser in range(32))
     assert np.allclose(medians, np.linspace(-10.67, 30.67, 32), atol=0.02)
-    assert "2012-01-15 there (1 files)" in details(data.check(), "found")
+    assert "2012-01-15 there (1 files)" in findings(data.check(), "found")

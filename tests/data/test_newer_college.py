@@ -5,6 +5,7 @@ import torch
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
 from lidarlearn.data.newer_college import NewerCollege
 from lidarlearn.geometry.projection import SphericalProjection
+from tests.data.datasets import findings
 from tests.data.settings import settings_of
 from tests.data.writers import write_newer_college
 
@@ -18,10 +19,6 @@ def newer_college(root, **settings):
 
 def truth_file(root):
     return root / WALK / "ground_truth" / "registered_poses.csv"
-
-
-def details(report, level):
-    return " | ".join(f"{f.what} {f.detail}" for f in report.findings if f.level == level)
 
 
 def test_round_trip(tmp_path):
@@ -50,7 +47,7 @@ def test_without_ground_truth(tmp_path):
     write_newer_college(tmp_path)
     truth_file(tmp_path).unlink()
     assert newer_college(tmp_path).sequence(WALK).T_world_lidar is None
-    assert "no ground truth" in details(newer_college(tmp_path).check(), "missing")
+    assert "no ground truth" in findings(newer_college(tmp_path).check(), "missing")
 
 
 def test_scans_outside_the_ground_truth_are_left_out_and_said_so(tmp_path, caplog):
@@ -86,7 +83,7 @@ def test_a_file_of_another_name(tmp_path):
     path = sorted((tmp_path / WALK / "raw_format" / "ouster_scan").iterdir())[0]
     path.rename(path.with_name("cloud.pcd"))
     assert len(newer_college(tmp_path).sequence(WALK)) == 3
-    assert "'cloud.pcd'" in details(newer_college(tmp_path).check(), "odd")
+    assert "'cloud.pcd'" in findings(newer_college(tmp_path).check(), "odd")
 
 
 def test_what_is_missing_is_named(tmp_path):

@@ -1,18 +1,11 @@
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import interpolate_poses
 from lidarlearn.data.pose_files import read_kitti_poses, read_times, read_tum_poses, start_at_identity
-from tests.data.writers import curve, kitti_rows
-
-
-def tum_rows(poses, times):
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    rows = np.concatenate([np.asarray(times)[:, None], poses[:, :3, 3], quaternions], axis=1)
-    return "# time tx ty tz qx qy qz qw\n" + "".join(" ".join(f"{v:.12f}" for v in row) + "\n" for row in rows)
+from tests.data.writers import curve, kitti_rows, tum_rows
 
 
 def test_kitti_round_trip(tmp_path):

@@ -22,9 +22,9 @@ from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import os1_64
 from tests import scenes
-from tests.data.bags import KINDS, OUSTER, PLAIN, TIMES_NS, details, first_coordinate, plain, rosbag
-from tests.data.test_pose_files import tum_rows
-from tests.data.writers import as_rows, curve, kitti_rows, random_points, write_bag
+from tests.data.bags import KINDS, OUSTER, PLAIN, TIMES_NS, first_coordinate, plain, rosbag
+from tests.data.datasets import findings
+from tests.data.writers import as_rows, curve, kitti_rows, random_points, tum_rows, write_bag
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_recordings_that_are_no_parts_of_one(tmp_path, later_s, said, caplog):
         write_bag(tmp_path / "day", name, {"/points": plain(30)}, start_s=start_s)
     report = rosbag(tmp_path).check()
     assert report.usable and len(rosbag(tmp_path).sequence("day")) <= 60
-    for text in (details(report, "odd"), caplog.text):
+    for text in (findings(report, "odd"), caplog.text):
         assert (f"data.root={tmp_path / 'day'}" in text) == (said is not None)
         assert said is None or f"two of them {said}" in text
     assert rosbag(tmp_path / "day").names == ("run1", "run2")
@@ -129,7 +129,7 @@ def test_files_compressed_as_a_whole_are_to_be_unpacked_once(tmp_path, kind):
     path = write_bag(tmp_path, "street", {"/points": plain(3)}, kind, compression="FILE")
     with pytest.raises(UserError, match=f"rosbags-convert --src {path} "):
         rosbag(tmp_path).sequence("street")
-    assert "compressed as a whole" in details(rosbag(tmp_path).check(), "missing")
+    assert "compressed as a whole" in findings(rosbag(tmp_path).check(), "missing")
     convert = [sys.executable, "-m", "rosbags.convert", "--src", path, "--dst", tmp_path / "unpacked"]
     subprocess.run(convert, check=True)
     assert len(rosbag(tmp_path).sequence("unpacked")) == 3
@@ -155,10 +155,10 @@ def test_topics(tmp_path, kind):
         with pytest.raises(UserError, match=f"no point clouds in topic {absent}\\.\n.*to one of /front"):
             rosbag(tmp_path, topic=absent).sequence("street")
     report = rosbag(tmp_path).check()
-    assert not report.usable and "several topics hold point clouds" in details(report, "missing")
-    assert "/chatter (std_msgs/msg/String, 1 messages)" in details(report, "found")
+    assert not report.usable and "several topics hold point clouds" in findings(report, "missing")
+    assert "/chatter (std_msgs/msg/String, 1 messages)" in findings(report, "found")
     write_bag(tmp_path, "silence", {}, kind)
-    assert "no PointCloud2" in details(rosbag(tmp_path).check(), "missing")  # whatever else there is
+    assert "no PointCloud2" in findings(rosbag(tmp_path).check(), "missing")  # whatever else there is
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -167,7 +167,7 @@ def test_bags_without_clouds(tmp_path, kind, topics):
     write_bag(tmp_path, "street", topics, kind)
     with pytest.raises(UserError, match="no PointCloud2 messages"):
         rosbag(tmp_path).sequence("street")
-    assert "no PointCloud2 messages" in details(rosbag(tmp_path).check(), "missing")
+    assert "no PointCloud2 messages" in findings(rosbag(tmp_path).check(), "missing")
 
 
 def test_messages_without_points_are_passed_over(tmp_path):
@@ -180,7 +180,7 @@ def test_messages_without_points_are_passed_over(tmp_path):
     assert np.allclose(sequence.T_world_lidar, curve(3))
     assert len(rosbag(tmp_path, max_frames=2).sequence("street").T_world_lidar) == 2  # whatever the rest holds
     report = rosbag(tmp_path).check()
-    assert report.usable and "3 poses for 4 messages" in details(report, "odd")
+    assert report.usable and "3 poses for 4 messages" in findings(report, "odd")
     (tmp_path / "street.txt").write_text(kitti_rows(curve(1)))
     with pytest.raises(DamagedFileError, match="1 poses for the first 2 scans"):
         rosbag(tmp_path, max_frames=2).sequence("street")
@@ -305,7 +305,7 @@ def test_an_mcap_of_ros_1_is_not_called_damaged(tmp_path):
 def test_missing_storage(tmp_path):
     path = write_bag(tmp_path, "street", {"/points": plain()}, "mcap")
     (path / "street.mcap").unlink()
-    assert "missing" in details(rosbag(tmp_path).check(), "missing")
+    assert "missing" in findings(rosbag(tmp_path).check(), "missing")
     with pytest.raises(DamagedFileError, match="missing"):
         rosbag(tmp_path).sequence("street")
 
@@ -327,7 +327,7 @@ def test_deskewing_needs_point_times(tmp_path):
     for name in ("without", "zero"):
         with pytest.raises(UserError, match=r"data\.deskew=false"):
             data.sequence(name)
-    assert "no point times" in details(data.check(), "missing")
+    assert "no point times" in findings(data.check(), "missing")
 
 
 def test_beams_are_raised(tmp_path):
@@ -379,7 +379,7 @@ def test_without_the_library(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(UserError, match=r"pip install 'lidarlearn\[rosbag\]'"):
         rosbag(tmp_path).sequence("street")
-    assert "package rosbags" in details(rosbag(tmp_path).check(), "missing")
+    assert "package rosbags" in findings(rosbag(tmp_path).check(), "missing")
 
 
 def test_an_odometry_recovers_the_motion(tmp_path, monkeypatch):

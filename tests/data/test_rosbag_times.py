@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from lidarlearn.data.bag_files import Bag, find_bags
 from lidarlearn.data.errors import DamagedFileError
-from tests.data.bags import KINDS, OUSTER, PLAIN, TIMES_NS, details, first_coordinate, plain, rosbag
-from tests.data.test_pose_files import tum_rows
-from tests.data.writers import as_rows, curve, kitti_rows, random_points, write_bag
+from tests.data.bags import KINDS, OUSTER, PLAIN, TIMES_NS, first_coordinate, plain, rosbag
+from tests.data.datasets import findings
+from tests.data.writers import as_rows, curve, kitti_rows, random_points, tum_rows, write_bag
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -19,7 +19,7 @@ def test_tum_ground_truth_by_the_stamps_of_the_headers(tmp_path, kind):
     two_steps = np.linalg.inv(curve(3)[1]) @ curve(5)[4]  # from 0.2 s to 0.8 s
     assert np.allclose(sequence.T_world_lidar[2], two_steps, atol=1e-8)
     assert np.allclose(sequence.timestamps, [0.2, 0.5, 0.8])
-    assert "street.tum with" in details(rosbag(tmp_path).check(), "found")
+    assert "street.tum with" in findings(rosbag(tmp_path).check(), "found")
 
 
 def turn(time):
@@ -114,15 +114,15 @@ def test_clouds_that_the_ground_truth_does_not_cover_are_left_out(tmp_path, kind
     assert rosbag(tmp_path, max_frames=2).sequence("street").timestamps.tolist() == pytest.approx([0.4, 0.5])
     report = rosbag(tmp_path).check()
     assert report.usable
-    assert "from 0.410 to 0.610 s, of scans from 0.100 to 1.000 s: those outside are left" in details(report, "odd")
+    assert "from 0.410 to 0.610 s, of scans from 0.100 to 1.000 s: those outside are left" in findings(report, "odd")
     truth.write_text(tum_rows(curve(3), [0.1, 0.2, 0.3]))
-    assert "those outside are left" in details(rosbag(tmp_path).check(), "odd")
+    assert "those outside are left" in findings(rosbag(tmp_path).check(), "odd")
     for times in ([5, 6, 7], [-7, -6, -5]):
         truth.write_text(tum_rows(curve(3), times))
         with pytest.raises(DamagedFileError, match=r"do not overlap(.|\n)*the same clock"):
             rosbag(tmp_path).sequence("street")
         report = rosbag(tmp_path).check()
-        assert not report.usable and "use one clock" in details(report, "missing")
+        assert not report.usable and "use one clock" in findings(report, "missing")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -153,7 +153,7 @@ def test_kitti_ground_truth_and_a_cut(tmp_path):
         (path / "poses.txt").write_text(kitti_rows(curve(there)))
         with pytest.raises(DamagedFileError, match=f"{there} poses for 3 scans"):
             rosbag(tmp_path).sequence("street")
-        assert f"{there} poses for 3 messages" in details(rosbag(tmp_path).check(), "odd")
+        assert f"{there} poses for 3 messages" in findings(rosbag(tmp_path).check(), "odd")
 
 
 @pytest.mark.parametrize("stamps", [[0, 0, 0], [2, 1, 3]])

@@ -4,6 +4,7 @@ Written from the formats' descriptions with numpy and scipy alone, so that a rea
 containers of ROS bags by the library that writes and reads them for others.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -60,6 +61,12 @@ def write_float32(path: Path, points: np.ndarray, columns: int = 4) -> None:
 
 def kitti_rows(poses: np.ndarray) -> str:
     return "".join(" ".join(f"{v:.12e}" for v in pose[:3].reshape(-1)) + "\n" for pose in poses)
+
+
+def tum_rows(poses: np.ndarray, times: Iterable[float]) -> str:
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    rows = np.concatenate([np.asarray(times)[:, None], poses[:, :3, 3], quaternions], axis=1)
+    return "# time tx ty tz qx qy qz qw\n" + "".join(" ".join(f"{v:.12f}" for v in row) + "\n" for row in rows)
 
 
 def write_kitti_odometry(root: Path, name: str = "04", frames: int = 5) -> Written:
