@@ -9,10 +9,20 @@ from omegaconf import DictConfig
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.data.sequence import DataSet, LayoutReport
 
+SPLITS = ("train_sequences", "val_sequences", "test_sequences")
 
-def data_set(name: str, root: object, **settings: object) -> DataSet:
-    """What `data=name data.root=ROOT data.SETTING=...` selects; composing each config once saves most of the time."""
-    return instantiate(_config(name), root=str(root), **settings)
+
+def data_set(name: str, root: object, sequence: str | None = None, **settings: object) -> DataSet:
+    """What `data=name data.root=ROOT data.SETTING=...` selects; composing each config once saves most of the time.
+
+    Args:
+        name: option of the group `data`.
+        root: folder of the data set.
+        sequence: the only sequence of all three splits; None leaves those of the config.
+        settings: others than those of the config.
+    """
+    splits = {} if sequence is None else dict.fromkeys(SPLITS, sequence)
+    return instantiate(_config(name), root=str(root), **(splits | settings))
 
 
 @cache

@@ -5,18 +5,15 @@ from scipy.io import savemat
 
 from lidarlearn.data import ford_campus
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.ford_campus import FordCampus
 from lidarlearn.errors import UserError
-from lidarlearn.geometry.projection import SphericalProjection
-from tests.data.datasets import findings
-from tests.data.settings import settings_of
+from tests.data.datasets import data_set, findings
 from tests.data.writers import write_ford_campus
 
 NAME = "IJRR-Dataset-1"
 
 
 def ford(root, **settings):
-    return FordCampus(root, SphericalProjection(), [NAME], [NAME], [NAME], **(settings_of("ford_campus") | settings))
+    return data_set("ford_campus", root, NAME, **settings)
 
 
 def scan_file(root, number=76):

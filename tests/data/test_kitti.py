@@ -6,18 +6,14 @@ import torch
 
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.kitti import KittiOdometry
 from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
-from lidarlearn.geometry.projection import SphericalProjection
-from tests.data.datasets import findings
-from tests.data.settings import settings_of
+from tests.data.datasets import data_set, findings
 from tests.data.writers import T_CAMERA_LIDAR, kitti_rows, write_kitti_odometry
 
 
 def kitti(root, **settings):
-    splits = {"train_sequences": ["04"], "val_sequences": ["04"], "test_sequences": ["04"]}
-    return KittiOdometry(root, SphericalProjection(), **(settings_of("base/kitti_odometry") | splits | settings))
+    return data_set("kitti_00-08", root, "04", **settings)
 
 
 def test_round_trip(tmp_path):

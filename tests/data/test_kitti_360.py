@@ -3,17 +3,14 @@ import pytest
 import torch
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.kitti_360 import Kitti360
-from lidarlearn.geometry.projection import SphericalProjection
-from tests.data.datasets import findings
-from tests.data.settings import settings_of
+from tests.data.datasets import data_set, findings
 from tests.data.writers import relative_to_first, write_kitti_360
 
 DRIVE = "2013_05_28_drive_0003_sync"
 
 
-def kitti_360(root, name="0003", **settings):
-    return Kitti360(root, SphericalProjection(), [name], [name], [name], **(settings_of("kitti_360") | settings))
+def kitti_360(root, **settings):
+    return data_set("kitti_360", root, "0003", **settings)
 
 
 def poses_file(root):

@@ -4,23 +4,21 @@ import torch
 
 from lidarlearn.data import kitti_raw
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.kitti_raw import ODOMETRY_DRIVES, KittiRaw, sweep_times
+from lidarlearn.data.kitti_raw import ODOMETRY_DRIVES, sweep_times
 from lidarlearn.data.oxts import mercator, read_oxts_poses
 from lidarlearn.geometry import se3
-from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.geometry.voxels import grid_sample
 from lidarlearn.odometry.deskew import deskew
 from lidarlearn.registration.association.kdtree import KdTree
 from lidarlearn.registration.gauss_newton import GaussNewton
-from tests.data.datasets import findings
-from tests.data.settings import settings_of
+from tests.data.datasets import data_set, findings
 from tests.data.writers import write_kitti_raw
 
 DRIVE = "2011_09_26_drive_0009"
 
 
 def raw(root, name=DRIVE, **settings):
-    return KittiRaw(root, SphericalProjection(), [name], [name], [name], **(settings_of("kitti_raw") | settings))
+    return data_set("kitti_raw", root, name, **settings)
 
 
 def folder(root):

@@ -3,19 +3,16 @@ import pytest
 import torch
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.nclt import POINT, Nclt
+from lidarlearn.data.nclt import POINT
 from lidarlearn.errors import UserError
-from lidarlearn.geometry.projection import SphericalProjection
-from tests.data.datasets import findings
-from tests.data.settings import settings_of
+from tests.data.datasets import data_set, findings
 from tests.data.writers import relative_to_first, write_nclt
 
 DATE = "2012-01-08"
 
 
-def nclt(root, name=DATE, **settings):
-    settings = settings_of("nclt") | settings
-    return Nclt(root, SphericalProjection(32, 720, 31.3, -11.3), [name], [name], [name], **settings)
+def nclt(root, **settings):
+    return data_set("nclt", root, DATE, **settings)
 
 
 def truth_file(root):

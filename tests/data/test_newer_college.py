@@ -3,18 +3,14 @@ import pytest
 import torch
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError
-from lidarlearn.data.newer_college import NewerCollege
-from lidarlearn.geometry.projection import SphericalProjection
-from tests.data.datasets import findings
-from tests.data.settings import settings_of
+from tests.data.datasets import data_set, findings
 from tests.data.writers import write_newer_college
 
 WALK = "01_short_experiment"
 
 
 def newer_college(root, **settings):
-    settings = settings_of("newer_college") | settings
-    return NewerCollege(root, SphericalProjection(), [WALK], [WALK], [WALK], **settings)
+    return data_set("newer_college", root, WALK, **settings)
 
 
 def truth_file(root):
