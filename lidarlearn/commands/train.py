@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
@@ -197,7 +197,7 @@ def build_module(config: DictConfig, datamodule: OdometryDataModule, data_name: 
     """
 
     def plain(node: str) -> dict[str, Any]:
-        return OmegaConf.to_container(config[node], resolve=True)  # type: ignore[return-value]
+        return cast("dict[str, Any]", OmegaConf.to_container(config[node], resolve=True))
 
     trained_on = {
         "data": {key: value for key, value in plain("data").items() if key != "root"},

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import cast
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -121,7 +121,10 @@ def _half_of(pairs: int, device: torch.device) -> Bool[Tensor, "batch"]:
 def _where(chosen: Bool[Tensor, "batch"], changed: Pair, batch: Pair) -> Pair:
     """The chosen pairs from `changed`, the others from `batch`."""
 
-    def choose(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(chosen.reshape(-1, *[1] * (old.dim() - 1)), new, old)
+    def choose(key: Literal["reference", "target", "T_ref_new"]) -> Tensor:
+        return torch.where(chosen.reshape(-1, *[1] * (batch[key].dim() - 1)), changed[key], batch[key])
 
-    return cast(Pair, {key: choose(changed[key], batch[key]) for key in batch})  # type: ignore[literal-required]
+    pairs: Pair = {**batch, "reference": choose("reference"), "target": choose("target")}
+    if "T_ref_new" in batch:
+        pairs["T_ref_new"] = choose("T_ref_new")
+    return pairs

@@ -146,7 +146,8 @@ class PoseNetModule(LightningModule):
     @property
     def val_sequences(self) -> list[Sequence]:
         """The validation sequences, in the order of their loaders."""
-        return self.trainer.datamodule.val_sequences  # type: ignore[attr-defined]
+        datamodule = self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning sets it without declaring it
+        return datamodule.val_sequences
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """Optimizer over the network and the loss (which may have weights to learn), and its learning-rate schedule.
