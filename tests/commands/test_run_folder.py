@@ -3,8 +3,10 @@
 import sys
 
 import pytest
+from hydra import compose, initialize_config_dir
 
 from lidarlearn.commands import evaluation
+from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.run_folder import code_digest, held_run_folder
 from lidarlearn.errors import UserError
 from lidarlearn.source_digest import source_digest
@@ -51,6 +53,15 @@ def test_two_evaluations_do_not_write_into_one_folder_at_once(call, no_plots, tm
     assert f"{tmp_path}: another process writes its results there" in error and "hydra.run.dir=" in error
     call(*own)
     assert (tmp_path / "results.json").is_file()
+
+
+@pytest.mark.parametrize("program", ["train", "evaluate", "convergence"])
+def test_runs_that_start_at_once_have_a_folder_each(program):
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        one, two = (compose(program, return_hydra_config=True).hydra for _ in range(2))
+    folders = [one.run.dir, two.run.dir, one.sweep.dir, two.sweep.dir]  # the time is that of the first look
+    assert folders[0] < folders[1] and folders[2] < folders[3]
+    assert all(folder.startswith(f"outputs/{program}/") for folder in folders)
 
 
 @pytest.fixture
