@@ -1,4 +1,4 @@
-"""Clouds as drivers lay them out, and short ways to bags of them."""
+"""Point clouds in the layouts of drivers, and short ways to bags of them."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from tests.data.writers import as_rows, random_points
 
 KINDS = ("ros1", "sqlite3", "mcap")
 PLAIN = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
-# Ouster's layout: holes between the fields and after the last one, times in nanoseconds
+# Ouster's layout: gaps between the fields and after the last one, times in nanoseconds
 OUSTER = np.dtype(
     {
         "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring"],
@@ -24,9 +24,9 @@ def rosbag(root, **settings):
     return Rosbag(root, SphericalProjection(), **settings)
 
 
-def plain(count=3, first=0):
+def plain_clouds(count=3, first=0):
     return [as_rows(random_points(first + i), PLAIN) for i in range(count)]
 
 
-def first_coordinate(sequence, index):
+def first_x(sequence, index):
     return float(sequence.scan(index).points[0, 0])
