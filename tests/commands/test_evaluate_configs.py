@@ -1,40 +1,41 @@
-"""Every option of every group of configs/evaluate.yaml and configs/convergence.yaml fits what it configures."""
+"""The options of evaluate.py and of the measurement of convergence basins fit what they configure."""
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from lidarlearn.commands.configs import config_directory
-from tests.commands.binding import check_binds
+from tests.commands.configs import check_binds, composed, option_nodes, options
 
-CONFIGS = config_directory()
 PLACES = {
     "initialization": "initialization.cv",
-    "odometry": "odometry.kd_f2m",
+    "odometry": "odometry.p_f2m",
     "weight": "odometry.kd_f2m.registration.weight",
     "residual": "odometry.kd_f2m.registration.residual",
     "baseline": "baseline.kiss_icp",
     "pipeline": "pipeline",
     "projection": "data.projection",
 }
-OPTIONS = [
-    (group, path.relative_to(CONFIGS / group).with_suffix("").as_posix())
-    for group in PLACES
-    for path in sorted((CONFIGS / group).rglob("*.yaml"))
-]
 
 
-def composed(program, *overrides):
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return compose(program, ["run_dir=run", *overrides])
+@pytest.fixture(scope="module")
+def nodes():
+    return option_nodes("evaluate", *PLACES)
 
 
-@pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_option_composes_and_binds_to_its_target(group, option):
-    place = PLACES[group]
-    config = composed("evaluate", f"{group}={option}" if group == place else f"{group}@{place}={option}")
-    check_binds(OmegaConf.to_container(OmegaConf.select(config, place), resolve=True))
+@pytest.mark.parametrize(("group", "option"), [(group, option) for group in PLACES for option in options(group)])
+def test_option_binds_to_its_target(nodes, group, option):
+    check_binds(nodes[group, option])
 
 
-def test_what_probes_the_basins_of_convergence_binds_to_its_target():
-    check_binds(OmegaConf.to_container(composed("convergence"), resolve=True))
+def test_options_replace_the_defaults_at_their_places(nodes):
+    chosen = {group: options(group)[-1] for group in PLACES}
+    places = {group: group if group == place else f"{group}@{place}" for group, place in PLACES.items()}
+    config = composed("evaluate", *(f"{places[group]}={option}" for group, option in chosen.items()))
+    default = composed("evaluate")
+    for group, option in chosen.items():
+        node = OmegaConf.select(config, PLACES[group])
+        assert OmegaConf.to_container(node) == OmegaConf.to_container(nodes[group, option])
+        assert node != OmegaConf.select(default, PLACES[group])
+
+
+def test_settings_of_convergence_bind_to_their_targets():
+    check_binds(composed("convergence"))
