@@ -3,14 +3,15 @@ import os
 import numpy as np
 import pytest
 
-from lidarlearn.commands.data import data_groups, main
+from lidarlearn.commands.data import data_groups
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.scan_files import gaps, list_scans, natural_key, read_float32_rows, sequence_names
 from lidarlearn.errors import UserError
+from tests.data.datasets import data_set
 from tests.data.writers import random_points, write_float32
 
 
-def test_scans_come_in_natural_order(tmp_path):
+def test_scans_are_in_natural_order(tmp_path):
     for name in ("scan_10.bin", "scan_9.bin", "scan_100.bin", ".scan_1.bin", "notes.txt"):
         (tmp_path / name).write_bytes(b"x" * 16)
     scans = list_scans(tmp_path, (".bin",))
@@ -24,8 +25,8 @@ NANOSECONDS = ["1583836591.1190722000.bin", "1583836592.22498.bin", "1583836592.
 
 
 @pytest.mark.parametrize("names", [SECONDS, [f"scan_{name}" for name in SECONDS], NANOSECONDS])
-def test_seconds_since_1970_come_in_their_order(tmp_path, names):
-    """As Python prints a float of them, without the last zeros; or with nanoseconds that lack the first ones."""
+def test_scans_named_by_unix_time_are_in_order_of_time(tmp_path, names):
+    """Floats as Python prints them, without trailing zeros; or nanoseconds without leading zeros."""
     for name in sorted(names):
         (tmp_path / name).touch()
     assert list(list_scans(tmp_path, (".bin",)).names) == names
@@ -41,19 +42,19 @@ def test_seconds_since_1970_come_in_their_order(tmp_path, names):
         (["scan7.bin"], True),
     ],
 )
-def test_names_that_are_times_count_no_scans(tmp_path, names, counted):
+def test_names_of_times_are_not_scan_numbers(tmp_path, names, counted):
     for name in names:
         (tmp_path / name).touch()
     assert list_scans(tmp_path, (".bin",)).counted == counted
 
 
-def test_an_absent_folder_holds_no_scans(tmp_path):
+def test_absent_folder_holds_no_scans(tmp_path):
     assert len(list_scans(tmp_path / "nowhere", (".bin",))) == 0
 
 
 @pytest.mark.parametrize("name", [name for name in data_groups() if not name.startswith("simulated")])
-def test_folders_closed_to_us_and_links_in_a_circle_hold_nothing(name, tmp_path, monkeypatch, capsys):
-    """As lost+found is on every disk; a superuser, as whom tests may run, is stopped by no permission."""
+def test_unreadable_folders_and_circular_links_are_ignored(name, tmp_path, monkeypatch):
+    """Such as lost+found. Permissions do not stop a superuser, who may run the tests: the calls are replaced."""
     (tmp_path / "lost+found").mkdir()
     for link in ("circle", "circle.bin", "circle.bag"):
         (tmp_path / link).symlink_to(link)
@@ -71,13 +72,11 @@ def test_folders_closed_to_us_and_links_in_a_circle_hold_nothing(name, tmp_path,
     monkeypatch.setattr(os, "scandir", closed(os.scandir))
     monkeypatch.setattr(os, "stat", closed(os.stat))
     for root in (tmp_path, tmp_path / "lost+found", tmp_path / "lost+found" / "closed"):
-        with pytest.raises(SystemExit) as exited:
-            main(["check", f"data={name}", f"data.root='{root}'"])
-        assert exited.value.code == 1 and "NOT usable" in capsys.readouterr().out
+        assert not data_set(name, root).full_check().usable
     assert not any(len(list_scans(tmp_path / closed, (".bin",))) for closed in ("lost+found", "circle"))
 
 
-def test_natural_key_orders_by_value_then_by_text():
+def test_natural_key_orders_by_number_then_text():
     assert sorted(["b2", "a10", "a9", "a09"], key=natural_key) == ["a09", "a9", "a10", "b2"]
     assert sorted(["lot 10²", "②", "lot 9", "①"], key=natural_key) == ["lot 9", "lot 10²", "①", "②"]
 
@@ -86,22 +85,22 @@ def test_natural_key_orders_by_value_then_by_text():
     ("given", "expected"),
     [(["09", 10], ("09", "10")), (4, ("04",)), ("08", ("08",)), ([], ())],
 )
-def test_numbers_from_the_command_line_get_their_zeros_back(given, expected):
+def test_sequence_names_pad_numbers_with_zeros(given, expected):
     assert sequence_names(given, digits=2) == expected
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../00", "a/b", "a\\b", "..", ""])
-def test_paths_are_no_names_of_sequences(name):
+def test_sequence_names_refuse_paths(name):
     with pytest.raises(UserError, match="no name of a sequence"):
         sequence_names(["00", name])
 
 
-def test_gaps():
+def test_gaps_in_scan_numbers():
     assert gaps([3, 4, 7, 9]) == [(5, 6), (8, 8)]
     assert gaps([5, 6, 7]) == []
 
 
-def test_fingerprint_follows_files_and_settings_but_not_the_place(tmp_path):
+def test_fingerprint_depends_on_files_and_settings_only(tmp_path):
     for folder in ("a", "b"):
         write_float32(tmp_path / folder / "0.bin", random_points(0))
     a, b = (list_scans(tmp_path / folder, (".bin",)) for folder in ("a", "b"))
@@ -113,7 +112,7 @@ def test_fingerprint_follows_files_and_settings_but_not_the_place(tmp_path):
 
 
 @pytest.mark.parametrize("changed", ["0.bin", "5.bin", "9.bin"])
-def test_fingerprint_tells_clouds_of_one_size_apart(tmp_path, changed):
+def test_fingerprint_distinguishes_files_of_equal_size(tmp_path, changed):
     for i in range(10):
         write_float32(tmp_path / f"{i}.bin", random_points(i))
     before = list_scans(tmp_path, (".bin",)).fingerprint("R")
@@ -121,7 +120,7 @@ def test_fingerprint_tells_clouds_of_one_size_apart(tmp_path, changed):
     assert list_scans(tmp_path, (".bin",)).fingerprint("R") != before
 
 
-def test_rows_are_read_as_written(tmp_path):
+def test_read_float32_rows_returns_written_rows(tmp_path):
     points = random_points(0)
     write_float32(tmp_path / "0.bin", points, columns=5)
     rows = read_float32_rows(tmp_path / "0.bin", columns=5)
@@ -137,7 +136,7 @@ def test_rows_are_read_as_written(tmp_path):
         (np.array([1, np.inf, 2, 0], "<f4").tobytes(), "not finite"),
     ],
 )
-def test_damaged_rows_name_the_file(tmp_path, content, problem):
+def test_damaged_rows_error_names_file(tmp_path, content, problem):
     path = tmp_path / "000007.bin"
     path.write_bytes(content)
     with pytest.raises(DamagedFileError, match=problem) as caught:
@@ -145,6 +144,6 @@ def test_damaged_rows_name_the_file(tmp_path, content, problem):
     assert "000007.bin" in str(caught.value)
 
 
-def test_a_file_that_vanished_is_damage(tmp_path):
+def test_missing_file_raises_damaged_file_error(tmp_path):
     with pytest.raises(DamagedFileError, match="cannot be read"):
         read_float32_rows(tmp_path / "gone.bin", columns=4)

@@ -11,11 +11,11 @@ def _volume(mesh):
     return np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
 
 
-def test_box_is_closed_and_has_its_volume():
+def test_box_volume():
     assert _volume(box(2.0, 3.0, 4.0, base=1.0)) == pytest.approx(24.0)
 
 
-def test_cylinder_has_the_volume_of_its_prism():
+def test_cylinder_volume_is_that_of_prism():
     assert _volume(cylinder(2.0, 3.0, sides=6)) == pytest.approx(3.0 * 6 * 0.5 * 4 * np.sin(np.pi / 3))
 
 
@@ -24,13 +24,13 @@ def test_extruded_square_is_a_box():
     assert abs(_volume(extruded(outline, 3.0))) == pytest.approx(12.0)
 
 
-def test_moved_turns_about_z_then_shifts():
+def test_moved_rotates_about_z_then_shifts():
     mesh = box(2.0, 1.0, 1.0).moved(x=10.0, yaw=np.pi / 2)
     assert np.ptp(mesh.vertices, axis=0) == pytest.approx([1.0, 2.0, 1.0])
     assert mesh.vertices.mean(axis=0) == pytest.approx([10.0, 0, 0.5])
 
 
-def test_merge_keeps_every_triangle_in_place():
+def test_merge_keeps_all_triangles():
     a, b = box(1.0, 1.0, 1.0), box(1.0, 1.0, 1.0).moved(x=5.0)
     merged = merge([a, empty(), b])
     assert _volume(merged) == pytest.approx(2.0)
@@ -42,7 +42,7 @@ def test_instances_scale_each_copy():
     assert _volume(copies) == pytest.approx(9.0)
 
 
-def test_sheet_leaves_out_cells():
+def test_sheet_omits_masked_cells():
     points = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0), [0.0], indexing="ij"), axis=-1)[:, :, 0]
     keep = np.array([[True, False], [False, False]])
     assert len(sheet(points, keep).triangles) == 2
@@ -73,7 +73,7 @@ def test_sheet_leaves_out_cells():
         lambda rng: hall(rng, 20.0, 12.0, 6.0),
     ],
 )
-def test_objects_are_finite_of_human_scale_and_stand_on_the_ground(make):
+def test_objects_have_plausible_size_and_touch_ground(make):
     mesh = make(np.random.default_rng(0))
     assert np.isfinite(mesh.vertices).all()
     assert 0 <= mesh.triangles.min() and mesh.triangles.max() < len(mesh.vertices)

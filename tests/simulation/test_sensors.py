@@ -17,29 +17,29 @@ def test_clean_ranges_are_exact_to_half_a_step():
     assert abs(_measure(CLEAN, 12.3456) * RANGE_STEP - 12.3456).max() <= RANGE_STEP / 2
 
 
-def test_noise_has_its_mean_and_standard_deviation():
+def test_noise_has_zero_mean_and_given_deviation():
     ranges = _measure(replace(CLEAN, range_noise=0.03), 20.0) * RANGE_STEP
     assert ranges.mean() == pytest.approx(20.0, abs=5e-4)
     assert ranges.std() == pytest.approx(0.03, rel=0.02)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
-def test_drop_out_has_its_share(share):
+def test_drop_out_has_given_share(share):
     assert (_measure(replace(CLEAN, drop_out=share), 20.0) == 0).mean() == pytest.approx(share, abs=0.01)
 
 
-def test_half_of_the_returns_are_lost_at_reach_and_more_at_grazing_angles():
+def test_returns_are_lost_at_reach_and_grazing_angles():
     sensor = replace(CLEAN, reach=60.0)
     assert (_measure(sensor, 60.0) > 0).mean() == pytest.approx(0.5, abs=0.01)
     assert (_measure(sensor, 60.0, cos=0.25) > 0).mean() == pytest.approx(0.2, abs=0.01)
 
 
 @pytest.mark.parametrize("distance", [0.5, 120.5, np.inf])
-def test_nothing_is_reported_outside_the_limits(distance):
+def test_ranges_outside_limits_give_no_return(distance):
     assert not _measure(CLEAN, distance).any()
 
 
-def test_points_lie_on_their_beams_at_their_ranges():
+def test_points_lie_on_beams_at_measured_ranges():
     ranges = np.full((2, 1000), round(10 / RANGE_STEP), dtype=np.uint16)
     ranges[0, :] = 0
     points, times = CLEAN.points(ranges, index=0)
@@ -49,7 +49,7 @@ def test_points_lie_on_their_beams_at_their_ranges():
     assert times.min() == -0.5 and times.max() < 0.5
 
 
-def test_the_sweep_goes_from_the_rear_over_the_left_and_is_in_front_at_time_0():
+def test_sweep_runs_from_rear_over_left_to_front_at_time_0():
     points, times = CLEAN.points(np.full((2, 1000), 1000, dtype=np.uint16), index=0)
     forward = points[np.abs(times) < 1e-6][0]
     left = points[np.abs(times + 0.25) < 1e-6][0]
@@ -57,12 +57,12 @@ def test_the_sweep_goes_from_the_rear_over_the_left_and_is_in_front_at_time_0():
     assert left[1] > 0 and abs(left[0]) < 1e-5
 
 
-def test_columns_shift_from_scan_to_scan_by_less_than_a_column():
+def test_azimuths_shift_between_scans_by_part_of_a_column():
     shifts = (CLEAN.azimuths(0)[0] - np.array([CLEAN.azimuths(i)[0] for i in range(50)])) / (2 * np.pi / 1000)
     assert shifts.min() >= 0 and shifts.max() < 1 and len(np.unique(shifts.round(6))) == 50
 
 
-def test_directions_are_turned_into_the_world():
+def test_directions_are_rotated_into_world():
     R = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     assert CLEAN.directions(0, R[None]) == pytest.approx(CLEAN.directions(0) @ R.T, abs=1e-6)
 
@@ -77,13 +77,13 @@ def test_directions_are_turned_into_the_world():
         (os1_64(), 64, 21.2, -21.2),
     ],
 )
-def test_models(sensor, beams, top, bottom):
+def test_sensor_models_have_beams_of_data_sheets(sensor, beams, top, bottom):
     assert sensor.beams == beams
     assert (sensor.elevations_deg[0], sensor.elevations_deg[-1]) == pytest.approx((top, bottom))
     assert (np.diff(sensor.elevations_deg) < 0).all()
 
 
 @pytest.mark.parametrize("wrong", [{"max_range": 200.0}, {"columns": 0}, {"drop_out": 1.5}, {"min_range": 130.0}])
-def test_impossible_sensors_are_refused(wrong):
+def test_impossible_sensor_settings_are_refused(wrong):
     with pytest.raises(ValueError, match="a sensor needs"):
         replace(CLEAN, **wrong)

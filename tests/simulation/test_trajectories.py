@@ -13,7 +13,7 @@ def _drive(seed, style=motions.URBAN, speed=None, duration=25.0):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_town_drive_is_smooth_and_within_what_cars_do(seed):
+def test_urban_motion_is_smooth_within_limits_of_cars(seed):
     motion = _drive(seed)
     speed = np.linalg.norm(np.diff(motion.xy, axis=0), axis=1) / 0.05
     acceleration = np.diff(motion.speed) / 0.05
@@ -26,11 +26,11 @@ def test_a_town_drive_is_smooth_and_within_what_cars_do(seed):
 
 
 @pytest.mark.parametrize("style", [motions.URBAN, motions.HIGHWAY, motions.CAMPUS])
-def test_drives_start_in_motion(style):
+def test_speed_is_positive_at_start(style):
     assert min(_drive(seed, style).speed[0] for seed in range(20)) > 2.0
 
 
-def test_the_car_faces_where_it_goes():
+def test_heading_follows_course():
     motion = _drive(1)
     step = np.diff(motion.xy, axis=0)
     moving = np.linalg.norm(step, axis=1) > 0.05
@@ -40,7 +40,7 @@ def test_the_car_faces_where_it_goes():
 
 
 @pytest.mark.parametrize("speed", [3.0, 12.0, 30.0])
-def test_constant_speed_holds_from_the_first_instant_and_widens_turns(speed):
+def test_constant_speed_holds_and_limits_lateral_acceleration(speed):
     motion = _drive(2, speed=speed)
     step = np.linalg.norm(np.diff(motion.xy, axis=0), axis=1)
     assert step == pytest.approx(np.full(len(step), speed * 0.05), rel=2e-3)
@@ -48,42 +48,42 @@ def test_constant_speed_holds_from_the_first_instant_and_widens_turns(speed):
     assert lateral.max() < 4.5
 
 
-def test_speeds_resemble_kittis():
+def test_speeds_are_similar_to_kitti():
     town = np.concatenate([_drive(seed).speed for seed in range(40)]) * 3.6
     highway = np.concatenate([_drive(seed, motions.HIGHWAY).speed for seed in range(40)]) * 3.6
     assert 22 < town.mean() < 50 and town.max() < 60
     assert 72 < highway.mean() < 85 and 95 < highway.max() < 112
 
 
-def test_town_drives_turn_both_ways():
+def test_urban_motion_turns_left_and_right():
     rates = np.degrees(np.concatenate([np.diff(_drive(seed).heading) / 0.05 for seed in range(20)]))
     assert rates.min() < -25 and rates.max() > 25
 
 
-def test_a_segway_is_slow_turns_abruptly_and_swings():
+def test_segway_is_slow_with_abrupt_turns_and_sway():
     runs = [motions.segway(np.random.default_rng(seed), 0.0, 30.0) for seed in range(6)]
     assert max(run.speed.max() for run in runs) <= 1.51 and min(run.speed.min() for run in runs) >= -1e-6
     assert max(np.abs(np.diff(run.heading)).max() / 0.05 for run in runs) > np.radians(60)
     assert all(np.ptp(np.degrees(run.sway)) > 4 for run in runs)
 
 
-class _Slope(Terrain):
+class _InclinedPlane(Terrain):
     def height(self, xy):
         return 0.1 * xy[..., 0] + 0.05 * xy[..., 1]
 
 
-def test_the_sensor_stands_upright_on_an_inclined_plane():
+def test_sensor_is_perpendicular_to_inclined_plane():
     times = np.arange(0, 5, 0.05)
     xy = np.column_stack([10 * times, 0 * times])
     motion = PlanarMotion(times, xy, 0 * times, 0 * times + 10, 0 * times, xy)
-    T = on_ground(motion, _Slope(), Vehicle(sensor_height=1.7, sensor_forward=0.0)).poses
+    T = on_ground(motion, _InclinedPlane(), Vehicle(sensor_height=1.7, sensor_forward=0.0)).poses
     up = np.array([-0.1, -0.05, 1.0]) / np.linalg.norm([-0.1, -0.05, 1.0])
     assert T[50, :3, 2] == pytest.approx(up, abs=1e-3)
-    height = (T[:, :3, 3] - np.column_stack([xy, _Slope().height(xy)])) @ up
+    height = (T[:, :3, 3] - np.column_stack([xy, _InclinedPlane().height(xy)])) @ up
     assert height == pytest.approx(np.full(len(times), 1.7), abs=0.01)
 
 
-def test_a_trajectory_passes_its_poses_and_is_smooth_in_between():
+def test_trajectory_interpolates_poses_smoothly():
     trajectory = on_ground(_drive(3), Hills(np.random.default_rng(0), 2.0), Vehicle())
     assert trajectory.at(trajectory.times[::40]) == pytest.approx(trajectory.poses[::40], abs=1e-9)
     T = trajectory.at(np.arange(2.0, 20.0, 0.01))
@@ -96,8 +96,8 @@ def test_a_trajectory_passes_its_poses_and_is_smooth_in_between():
     assert np.degrees(np.abs(np.diff(rates, axis=0))).max() / 0.01 < 150
 
 
-def test_hills_have_their_slope():
-    xy, half = np.random.default_rng(0).uniform(-3000, 3000, (50000, 2)), np.array([0.5, 0.0])
+def test_hills_have_given_slope():
+    xy, half = np.random.default_rng(0).uniform(-3000, 3000, (10000, 2)), np.array([0.5, 0.0])
     slopes = [
         (hills.height(xy + half) - hills.height(xy - half)).std()
         for hills in (Hills(np.random.default_rng(seed), 2.0) for seed in range(30))
@@ -105,20 +105,20 @@ def test_hills_have_their_slope():
     assert np.degrees(np.arctan(np.mean(np.square(slopes)) ** 0.5)) == pytest.approx(2.0, rel=0.25)
 
 
-def test_ground_below_a_path_keeps_its_heights():
+def test_ground_below_path_keeps_heights():
     s = np.arange(0, 400, 1.0)
     points = np.column_stack([s, 30 * np.sin(s / 60), 5 * np.sin(s / 80)])
     assert np.abs(GroundBelow(points).height(points[:, :2]) - points[:, 2])[20:-20].max() < 0.1
 
 
-def test_extended_goes_straight_on():
+def test_extended_path_continues_straight():
     line = extended(np.column_stack([np.arange(0, 10, 0.3), np.zeros(34)]), 50.0)
     assert line[:, 1] == pytest.approx(np.zeros(len(line)))
     assert line[0, 0] < -48 and line[-1, 0] > 55
     assert np.diff(line[:, 0]) == pytest.approx(np.ones(len(line) - 1))
 
 
-def test_camera_poses_turn_into_the_lidars_axes(tmp_path):
+def test_camera_poses_are_converted_to_lidar_axes(tmp_path):
     forward_2m = "1 0 0 0 0 1 0 0 0 0 1 {}\n"
     (tmp_path / "00.txt").write_text(forward_2m.format(0) + forward_2m.format(2))
     T = read_poses(tmp_path / "00.txt", camera=True)
@@ -127,7 +127,7 @@ def test_camera_poses_turn_into_the_lidars_axes(tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "1 2 3\n4 5 6\n", "a b\n", "1 0 0 0 0 1 0 0 0 0 1 nan\n" * 2])
-def test_a_damaged_pose_file_is_named(tmp_path, content):
+def test_damaged_pose_file_error_names_file(tmp_path, content):
     (tmp_path / "bad.txt").write_text(content)
     with pytest.raises(UserError, match=r"bad\.txt"):
         read_poses(tmp_path / "bad.txt", camera=True)
