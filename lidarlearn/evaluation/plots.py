@@ -92,12 +92,17 @@ class Panel:
 
 
 def curves_figure(title: str, panels: list[Panel]) -> Figure:
-    """Panels side by side, with one legend for all of them."""
+    """Panels side by side, with one legend for all of them.
+
+    The markers are rings, the largest those of the first curve, so that curves with the same values all show.
+    """
     figure = Figure(figsize=(10, 4), dpi=_DPI, layout="constrained")
     row = figure.subplots(1, len(panels), squeeze=False)[0]
     for k, (axes, panel) in enumerate(zip(row, panels, strict=True)):
+        sizes = np.linspace(min(4 * len(panel.curves), 14), 4, len(panel.curves))
         for i, (name, curve) in enumerate(panel.curves.items()):
-            axes.plot(list(curve), list(curve.values()), marker="o", markersize=4, label=name, **_line(i))
+            style = {"marker": "o", "markersize": sizes[i], "fillstyle": "none", "clip_on": False}
+            axes.plot(list(curve), list(curve.values()), label=name, **style, **_line(i))
         axes.set_ylim(bottom=0)
         finish(axes, title if k == 0 else "", panel.x, panel.y)
     legend_beside(figure, row[0])
