@@ -16,7 +16,7 @@ CONFIGS = config_directory()
 def composed_with_hydra(program: str, *overrides: str) -> DictConfig:
     """The config of a command line, with Hydra's own node; composed once per process and therefore read-only."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        config = compose(program, ["run_dir=run", *overrides], return_hydra_config=True)
+        config = compose(program, ["++run_dir=run", *overrides], return_hydra_config=True)
     OmegaConf.set_readonly(config, True)
     return config
 
