@@ -1,4 +1,4 @@
-"""Changed pairs are those of a changed drive: their scans register to their labels."""
+"""Augmented pairs of scans are consistent: registration of their scans gives their labels."""
 
 import pytest
 import torch
@@ -24,12 +24,12 @@ def pair() -> Pair:
 
 
 def batch_of(pair: Pair, n: int) -> Pair:
-    """The same pair so many times, each counted in `index`."""
+    """`n` copies of a pair; `index` counts them."""
     return {key: value.expand(n, *value.shape) for key, value in pair.items()} | {"index": torch.arange(n)}
 
 
-def assert_scans_and_label_agree(pair: Pair) -> None:
-    """Registration, started a little off the label, ends at the label, and in a pixel of its own for each point."""
+def assert_registration_confirms_label(pair: Pair) -> None:
+    """Registration that starts beside the label ends at it, and points are in their own pixels."""
     reference, target = (pair[key].flatten(1).T for key in ("reference", "target"))
     reference, target = (points[(points != 0).any(1)] for points in (reference, target))
     tree = KdTree()
@@ -55,34 +55,34 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_scans_and_label_still_agree(change, pair):
+def test_augmented_scans_register_to_label(change, pair):
     torch.manual_seed(0)
     changed = CHANGES[change](pair)
     assert changed.keys() == pair.keys() and changed["index"] == 3
     assert changed["reference"].dtype == torch.float32
     assert (change == "none") == torch.equal(changed["reference"], pair["reference"])
-    assert_scans_and_label_agree(changed)
+    assert_registration_confirms_label(changed)
 
 
-def test_the_mirror_image_is_what_a_mirrored_drive_would_have_seen(pair):
+def test_mirrored_map_equals_map_of_mirrored_scan(pair):
     image = mirrored(pair)
     flip = torch.tensor([1.0, -1, 1])
     for key, pose in (("reference", se3.identity()), ("target", pair["T_ref_new"])):
         seen = FINE.vertex_map(cast(pose, FINE) * flip)
-        # Points exactly on a pixel's border may change sides.
+        # Points exactly on the border of a pixel may fall into its neighbour.
         same = ((image[key] - seen).abs().amax(0) < 0.01).float().mean()
         assert same > 0.98
     torch.testing.assert_close(se3.to_euler(image["T_ref_new"]), MOTION * torch.tensor([1, -1, 1, -1, 1, -1]))
 
 
-def test_a_turned_sensor_moves_in_another_direction_by_the_same_distance(pair):
-    quarter = turned(pair, torch.tensor(90))  # to the left: what was ahead is to the right
+def test_turning_rotates_direction_of_motion(pair):
+    quarter = turned(pair, torch.tensor(90))  # to the left
     assert se3.to_euler(quarter["T_ref_new"])[:3].tolist() == pytest.approx([-0.05, -0.4, 0.01], abs=1e-9)
     assert se3.rotation_angle(quarter["T_ref_new"]) == pytest.approx(se3.rotation_angle(pair["T_ref_new"]))
 
 
-def test_the_pairs_of_a_batch_are_each_changed_as_if_alone(pair):
-    """The chances are drawn for all at once; what they do to one pair is what the functions above do to it."""
+def test_batch_is_augmented_pair_by_pair(pair):
+    """Random numbers are drawn for the whole batch, but act on each pair as the single functions do."""
     n = 16
     torch.manual_seed(1)
     batch = Augmentation(mirror=True, reverse=True, turn=True)(batch_of(pair, n))
@@ -98,7 +98,7 @@ def test_the_pairs_of_a_batch_are_each_changed_as_if_alone(pair):
 
 
 @pytest.mark.parametrize("change", ["mirrored", "turned", "reversed"])
-def test_undone_it_is_no_change(change, pair):
+def test_inverse_change_restores_pair(change, pair):
     undo = {
         "mirrored": lambda: mirrored(mirrored(pair)),
         "turned": lambda: turned(turned(pair, torch.tensor(50)), torch.tensor(310)),
@@ -110,19 +110,19 @@ def test_undone_it_is_no_change(change, pair):
     torch.testing.assert_close(again["T_ref_new"], pair["T_ref_new"])
 
 
-def test_without_a_label_none_is_made_up(pair):
+def test_augmentation_adds_no_label(pair):
     bare = batch_of({key: pair[key] for key in ("reference", "target", "index")}, 8)
-    everything = Augmentation(mirror=True, turn=True, reverse=True, drop_out=0.3)
-    assert "T_ref_new" not in everything(bare)
+    all_changes = Augmentation(mirror=True, turn=True, reverse=True, drop_out=0.3)
+    assert "T_ref_new" not in all_changes(bare)
 
 
-def test_half_of_the_pairs_are_mirrored(pair):
+def test_half_of_pairs_are_mirrored(pair):
     torch.manual_seed(0)
     batch = Augmentation(mirror=True)(batch_of(pair, 200))
     assert 70 < sum(torch.equal(image, pair["reference"]) for image in batch["reference"]) < 130
 
 
-def test_no_more_is_dropped_than_asked_for(pair):
+def test_drop_out_is_limited_to_given_share(pair):
     torch.manual_seed(0)
     before = int(activated(pair["reference"]).sum())
     batch = Augmentation(drop_out=0.5)(batch_of(pair, 40))
@@ -132,23 +132,23 @@ def test_no_more_is_dropped_than_asked_for(pair):
     assert not torch.equal(activated(batch["reference"]), activated(batch["target"]))
 
 
-def test_the_same_seed_does_the_same(pair):
-    """Else a training that goes on would not see the batches of an unbroken one."""
-    everything = Augmentation(mirror=True, turn=True, reverse=True, drop_out=0.3)
+def test_equal_seeds_give_equal_batches(pair):
+    """A resumed training must see the batches of an uninterrupted one."""
+    all_changes = Augmentation(mirror=True, turn=True, reverse=True, drop_out=0.3)
     batches = []
     for _ in range(2):
         torch.manual_seed(3)
-        batches.append(everything(batch_of(pair, 4)))
+        batches.append(all_changes(batch_of(pair, 4)))
     assert all(torch.equal(batches[0][key], batches[1][key]) for key in batches[0])
 
 
-def test_each_batch_loses_pixels_of_its_own(pair):
+def test_dropped_pixels_differ_between_batches(pair):
     torch.manual_seed(0)
     first, second = (activated(Augmentation(drop_out=0.5)(batch_of(pair, 1))["reference"]) for _ in range(2))
     assert not torch.equal(first, second)
 
 
-def test_nothing_is_left_to_chance_that_is_switched_off(pair):
+def test_disabled_augmentation_draws_no_random_numbers(pair):
     state = torch.get_rng_state()
     batch = batch_of(pair, 2)
     same = Augmentation()(batch)

@@ -13,7 +13,7 @@ def elevation(points):
 
 
 @pytest.mark.parametrize("angle_deg", [0.205, -0.5, 3.0])
-def test_raises_elevation_and_keeps_range_and_azimuth(angle_deg):
+def test_raise_beams_changes_elevation_only(angle_deg):
     points = torch.from_numpy(random_points(0)).double()
     raised = raise_beams(points, angle_deg)
     assert torch.allclose(elevation(raised) - elevation(points), torch.tensor(math.radians(angle_deg)).double())
@@ -21,7 +21,7 @@ def test_raises_elevation_and_keeps_range_and_azimuth(angle_deg):
     assert torch.allclose(torch.atan2(raised[:, 1], raised[:, 0]), torch.atan2(points[:, 1], points[:, 0]))
 
 
-def test_is_the_rotation_about_p_cross_z():
+def test_raise_beams_rotates_about_p_cross_z():
     points = torch.from_numpy(random_points(1)).double()
     axis = torch.linalg.cross(points, torch.tensor([[0.0, 0.0, 1.0]]).double().expand_as(points))
     phi = math.radians(0.205) * axis / axis.norm(dim=1, keepdim=True)
@@ -29,7 +29,7 @@ def test_is_the_rotation_about_p_cross_z():
     assert torch.allclose(raise_beams(points, 0.205), (T[:, :3, :3] @ points[:, :, None])[..., 0])
 
 
-def test_points_on_the_axis_and_a_zero_angle_change_nothing():
+def test_points_on_axis_and_zero_angle_are_unchanged():
     axis = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [0.0, 0.0, -2.0]])
     assert torch.equal(raise_beams(axis, 0.205), axis)
     points = torch.from_numpy(random_points(2))

@@ -1,4 +1,4 @@
-"""The cache of vertex maps: faithful, shared, and made again when it has to be."""
+"""The cache of vertex maps."""
 
 import errno
 import importlib
@@ -24,7 +24,7 @@ from tests.box_world import SMALL, BoxSequence
 
 
 class CountingSequence(BoxSequence):
-    """Counts how often scans are read; one of them may be damaged, or the process may be interrupted there."""
+    """Records which scans are read; one may be damaged, or interrupt the process."""
 
     def __init__(self, frames=7, damaged=None, interrupted=None):
         super().__init__("1", frames)
@@ -39,7 +39,7 @@ class CountingSequence(BoxSequence):
         return super().scan(index)
 
 
-def test_maps_are_those_of_the_scans_to_half_a_quantum(tmp_path):
+def test_cached_maps_equal_projected_scans_to_half_quantum(tmp_path):
     sequence = BoxSequence("1", frames=4)
     maps = cached_vertex_maps(sequence, SMALL, tmp_path)
     assert len(maps) == 4 and maps[0].dtype == torch.int16
@@ -49,25 +49,25 @@ def test_maps_are_those_of_the_scans_to_half_a_quantum(tmp_path):
         assert (activated(decode(maps[i])) == activated(exact)).all()
 
 
-def test_a_frame_of_the_paper_s_size_takes_280_kb_at_most(tmp_path):
+def test_frame_of_64x720_takes_at_most_280_kb(tmp_path):
     cached_vertex_maps(BoxSequence("1", frames=3), SphericalProjection(), tmp_path)
     assert sum(f.stat().st_size for f in tmp_path.rglob("*") if f.is_file()) <= 3 * 280_000
 
 
-def test_points_beyond_16_bits_become_empty_pixels():
+def test_points_beyond_16_bit_range_become_empty_pixels():
     vertex_map = torch.tensor([[131.0, 132.0, -200.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])[:, None]
     kept = activated(decode(encode(vertex_map)))
     assert kept.tolist() == [[True, False, False]]
 
 
-def test_scans_are_read_once(tmp_path):
+def test_second_call_reads_no_scans(tmp_path):
     sequence = CountingSequence()
     cached_vertex_maps(sequence, SMALL, tmp_path)
     cached_vertex_maps(sequence, SMALL, tmp_path)
     assert sequence.read == list(range(7))
 
 
-def test_other_settings_make_another_cache(tmp_path):
+def test_other_projection_or_length_makes_new_cache(tmp_path):
     sequence = CountingSequence(frames=3)
     for projection in (SMALL, replace(SMALL, width=48), replace(SMALL, fov_up_deg=10.0)):
         assert cached_vertex_maps(sequence, projection, tmp_path)[0].shape == (3, 16, projection.width)
@@ -76,13 +76,13 @@ def test_other_settings_make_another_cache(tmp_path):
     assert len(sequence.read) == 9 and len(longer.read) == 4
 
 
-def test_an_interrupted_cache_is_completed_and_what_was_done_is_kept(tmp_path, monkeypatch):
+def test_interrupted_cache_is_continued(tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "_CHUNK", 2)
     with pytest.raises(KeyboardInterrupt):
         cached_vertex_maps(CountingSequence(interrupted=5), SMALL, tmp_path)
     again = CountingSequence()
     maps = cached_vertex_maps(again, SMALL, tmp_path)
-    assert again.read == [4, 5, 6]  # 0 to 3 were noted as done, in chunks of two
+    assert again.read == [4, 5, 6]  # chunks of two: 0 to 3 were done
     for i in range(7):
         torch.testing.assert_close(maps[i], encode(SMALL.vertex_map(again.scan(i).points)))
 
@@ -90,10 +90,10 @@ def test_an_interrupted_cache_is_completed_and_what_was_done_is_kept(tmp_path, m
 @pytest.mark.parametrize("file", ["vertex_maps.npy", "done.npy"])
 @pytest.mark.parametrize("left", [None, 0, 40, 0.5, 0.99])
 @pytest.mark.parametrize("complete", [True, False])
-def test_a_lost_or_truncated_file_is_made_again(tmp_path, file, left, complete):
+def test_missing_or_truncated_file_is_rebuilt(tmp_path, file, left, complete):
     cached_vertex_maps(CountingSequence(), SMALL, tmp_path)
     path = next(tmp_path.rglob(file))
-    if not complete:  # one frame is still to be projected
+    if not complete:  # one frame is missing
         done = np.lib.format.open_memmap(path.with_name("done.npy"), mode="r+")
         done[5] = False
         done.flush()
@@ -109,7 +109,7 @@ def test_a_lost_or_truncated_file_is_made_again(tmp_path, file, left, complete):
         torch.testing.assert_close(maps[i], encode(SMALL.vertex_map(again.scan(i).points)))
 
 
-def test_a_changed_reader_makes_another_cache(tmp_path, monkeypatch):
+def test_changed_reader_code_makes_new_cache(tmp_path, monkeypatch):
     first = cached_vertex_maps(CountingSequence(), SMALL, tmp_path)
     digests = []
     monkeypatch.setattr(cache, "source_digest", lambda *origins: digests.append(origins) or "of other code")
@@ -118,7 +118,7 @@ def test_a_changed_reader_makes_another_cache(tmp_path, monkeypatch):
     assert digests[0] == (CountingSequence, Path(cache.__file__))
 
 
-def test_a_changed_helper_of_a_reader_makes_another_cache(tmp_path, monkeypatch):
+def test_changed_import_of_reader_makes_new_cache(tmp_path, monkeypatch):
     (tmp_path / "my_reader.py").write_text(
         "from my_scale import SCALE\n"
         "from lidarlearn.data.sequence import Scan\n"
@@ -131,7 +131,7 @@ def test_a_changed_helper_of_a_reader_makes_another_cache(tmp_path, monkeypatch)
     ranges = []
     for scale in (1.0, 0.5):
         (tmp_path / "my_scale.py").write_text(f"SCALE = {scale}{'  ' * int(1 / scale)}\n")
-        for name in ("my_reader", "my_scale"):  # as another process begins
+        for name in ("my_reader", "my_scale"):  # as in another process
             monkeypatch.delitem(sys.modules, name, raising=False)
         source_digest.cache_clear()
         sequence = importlib.import_module("my_reader").Scaled("1", frames=2)
@@ -143,27 +143,27 @@ def test_a_changed_helper_of_a_reader_makes_another_cache(tmp_path, monkeypatch)
     "ignore:This process:DeprecationWarning"
 )  # fork beside torch's threads, from Python 3.12 on
 @pytest.mark.parametrize("num_workers", [0, 2])
-def test_a_damaged_scan_is_named_also_from_a_worker(tmp_path, num_workers):
+def test_damaged_scan_error_names_file(tmp_path, num_workers):
     with pytest.raises(UserError, match=r"scan\.bin: it is truncated") as raised:
         cached_vertex_maps(CountingSequence(damaged=3), SMALL, tmp_path, num_workers)
     assert "Traceback" not in str(raised.value)
 
 
-def test_a_full_disk_is_told_before_it_kills(tmp_path, monkeypatch):
+def test_full_disk_is_refused_with_setting(tmp_path, monkeypatch):
     usage = type("usage", (), {"free": 1000})
     monkeypatch.setattr(cache.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(UserError, match=r"datamodule\.cache_root"):
         cached_vertex_maps(CountingSequence(), SMALL, tmp_path)
 
 
-def test_the_room_of_all_maps_is_taken_before_the_first_scan_is_read(tmp_path):
+def test_file_is_allocated_before_first_scan_is_read(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         cached_vertex_maps(CountingSequence(interrupted=0), SMALL, tmp_path)
     file = next(tmp_path.rglob("vertex_maps.npy")).stat()
     assert 512 * file.st_blocks >= file.st_size
 
 
-def test_a_disk_that_others_fill_is_told_too(tmp_path, monkeypatch):
+def test_failed_allocation_leaves_no_file(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -177,7 +177,7 @@ def test_a_disk_that_others_fill_is_told_too(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("maps", "fit"), [(2.9, True), (1.9, False)])
-def test_the_room_is_that_of_what_is_lacking_of_all_sequences(tmp_path, monkeypatch, maps, fit):
+def test_require_room_counts_missing_maps_of_all_sequences(tmp_path, monkeypatch, maps, fit):
     frames = 7 * 3 * SMALL.height * SMALL.width * 2
     cached_vertex_maps(BoxSequence("0", frames=7), SMALL, tmp_path)
     usage = type("usage", (), {"free": int(50_000_000 + maps * frames)})
@@ -190,17 +190,17 @@ def test_the_room_is_that_of_what_is_lacking_of_all_sequences(tmp_path, monkeypa
             require_room(sequences, SMALL, tmp_path)
 
 
-def test_maps_travel_to_workers_as_a_path(tmp_path):
+def test_maps_are_pickled_as_path(tmp_path):
     maps = cached_vertex_maps(BoxSequence("1", frames=30), SMALL, tmp_path)
     luggage = pickle.dumps(maps)
     assert len(luggage) < 2000
     torch.testing.assert_close(pickle.loads(luggage)[29], maps[29])
 
 
-def test_maps_may_exceed_the_memory(tmp_path):
+def test_maps_may_exceed_memory(tmp_path):
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     count = 4 * memory // (2 * 3 * 64 * 1024)
-    np.lib.format.open_memmap(tmp_path / "0.npy", mode="w+", dtype=np.int16, shape=(count, 3, 64, 1024))  # of holes
+    np.lib.format.open_memmap(tmp_path / "0.npy", mode="w+", dtype=np.int16, shape=(count, 3, 64, 1024))  # sparse
     assert not VertexMaps(tmp_path / "0.npy")[torch.tensor([0, count - 1])].any()
 
 
@@ -215,7 +215,7 @@ def _build(root, start, results):
 @pytest.mark.filterwarnings(
     "ignore:This process:DeprecationWarning"
 )  # fork beside torch's threads, from Python 3.12 on
-def test_two_processes_at_once_share_the_work_and_the_result(tmp_path):
+def test_concurrent_processes_project_each_scan_once(tmp_path):
     context = multiprocessing.get_context("fork")
     start, results = context.Event(), context.Queue()
     processes = [context.Process(target=_build, args=(tmp_path, start, results)) for _ in range(2)]

@@ -40,7 +40,7 @@ def test_bin_and_npy_round_trip(tmp_path, columns):
 
 
 @pytest.mark.parametrize("shape", [(200,), (4, 50)])
-def test_npy_of_named_fields(tmp_path, shape):
+def test_npy_with_named_fields(tmp_path, shape):
     points = random_points(0)
     points[3] = np.nan
     fields = [("X", ">f8"), ("y", "<f4"), ("z", "<f4"), ("ring", "u1"), ("intensity", "u1"), ("t", "<u4")]
@@ -54,7 +54,7 @@ def test_npy_of_named_fields(tmp_path, shape):
 
 
 @pytest.mark.parametrize("suffix", [".pcd", ".ply"])
-def test_points_that_stand_for_no_return_are_left_out_with_their_fields(tmp_path, suffix):
+def test_points_without_return_are_dropped_with_their_fields(tmp_path, suffix):
     points = random_points(0)
     points[3], points[5, 1] = 0, np.nan
     path = tmp_path / f"0{suffix}"
@@ -66,11 +66,11 @@ def test_points_that_stand_for_no_return_are_left_out_with_their_fields(tmp_path
     assert cloud.intensities is not None and len(cloud.intensities) == 198
 
 
-def cut(path):
+def truncate(path):
     path.write_bytes(path.read_bytes()[:-7])
 
 
-def cut_whole_points(path):
+def truncate_whole_points(path):
     path.write_bytes(path.read_bytes()[: -5 * (20 if path.suffix == ".pcd" else 24)])
 
 
@@ -78,13 +78,13 @@ def cut_whole_points(path):
 @pytest.mark.parametrize(
     ("damage", "problem"),
     [
-        (cut, "truncated"),
-        (cut_whole_points, "truncated"),
+        (truncate, "truncated"),
+        (truncate_whole_points, "truncated"),
         (lambda p: p.write_bytes(b""), "the file is empty"),
         (lambda p: p.write_bytes(b"x\n"), "no .p(cd|ly) file"),
     ],
 )
-def test_damaged_pcd_and_ply_name_the_file(tmp_path, suffix, damage, problem):
+def test_damaged_pcd_or_ply_error_names_file(tmp_path, suffix, damage, problem):
     path = tmp_path / f"scan{suffix}"
     (write_pcd if suffix == ".pcd" else write_ply)(path, random_points(0), TIMES)
     damage(path)
@@ -97,8 +97,8 @@ def test_damaged_pcd_and_ply_name_the_file(tmp_path, suffix, damage, problem):
     ("kind", "dtype"),
     [("uchar", "u1"), ("uint8", "u1"), ("ushort", "u2"), ("short", "i2"), ("float64", "f8"), ("uint32", "u4")],
 )
-def test_ply_of_every_type_between_other_elements(tmp_path, encoding, kind, dtype):
-    """As PCL writes a camera, meshes have faces, and Open3D mixes the two sets of names."""
+def test_ply_vertices_of_each_type_among_other_elements(tmp_path, encoding, kind, dtype):
+    """PCL writes an element `camera`, meshes have faces, and Open3D mixes both sets of type names."""
     points, values = random_points(0, 5), [0, 100, 127, 128, 255]
     header = (
         f"ply\nformat {encoding} 1.0\nelement camera 2\nproperty float k\nproperty int w\nelement vertex 5\n"
@@ -120,7 +120,7 @@ def test_ply_of_every_type_between_other_elements(tmp_path, encoding, kind, dtyp
     assert cloud.intensities is not None and cloud.intensities.tolist() == values
 
 
-def test_a_ply_that_begins_with_lists_is_refused_by_their_name(tmp_path):
+def test_ply_with_lists_before_vertices_is_refused(tmp_path):
     header = "ply\nformat {} 1.0\nelement face 1\nproperty list uchar int corners\nelement vertex 1\n"
     (tmp_path / "0.ply").write_text(header.format("binary_little_endian") + "property float x\nend_header\nabcd")
     with pytest.raises(DamagedFileError, match=r"no \.ply file that can be read \(.*list uchar int corners"):
@@ -141,7 +141,7 @@ PCD = "VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 
         ("WIDTH 2", "VIEWPOINT 0 0 0 1 0 0 0\nWIDTH 2"),
     ],
 )
-def test_pcd_headers_as_the_format_allows(tmp_path, encoding, usual, found):
+def test_pcd_header_variants_are_read(tmp_path, encoding, usual, found):
     body = b"1 2 3 4\n5 6 7 8\n" if encoding == "ascii" else np.arange(1, 9, dtype="<f4").tobytes()
     header = f"{PCD}DATA {encoding}\n".replace(usual, found)
     (tmp_path / "0.pcd").write_bytes(header.encode("latin-1") + body)
@@ -150,13 +150,13 @@ def test_pcd_headers_as_the_format_allows(tmp_path, encoding, usual, found):
 
 
 @pytest.mark.parametrize("line", ["1 2 3 4 \n", "1\t2\t3\t4\n", "  1  2 3 4\r\n", "1 2 3 4"])
-def test_pcd_in_text_of_a_single_point_and_any_blanks(tmp_path, line):
+def test_ascii_pcd_with_single_point_and_any_whitespace(tmp_path, line):
     header = PCD.replace("WIDTH 2", "WIDTH 1").replace("POINTS 2", "POINTS 1")
     (tmp_path / "0.pcd").write_bytes(f"{header}DATA ascii\n{line}".encode())
     assert read_cloud(tmp_path / "0.pcd").points.tolist() == [[1, 2, 3]]
 
 
-def test_text_with_too_few_points_is_truncated(tmp_path):
+def test_ascii_file_with_too_few_points_is_truncated(tmp_path):
     (tmp_path / "0.pcd").write_text(f"{PCD}DATA ascii\n1 2 3 4\n")
     header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
     (tmp_path / "0.ply").write_text(f"{header}end_header\n1 2 3\n")
@@ -176,14 +176,14 @@ def test_text_with_too_few_points_is_truncated(tmp_path):
         np.zeros(4, [("u", "f4")]),
     ],
 )
-def test_npy_without_points(tmp_path, rows):
+def test_npy_without_points_is_refused(tmp_path, rows):
     np.save(tmp_path / "scan.npy", rows)
     with pytest.raises(DamagedFileError, match=r"scan\.npy"):
         read_cloud(tmp_path / "scan.npy")
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".npy", ".pcd", ".ply"])
-def test_a_scan_without_a_return_is_an_empty_one(tmp_path, suffix):
+def test_scan_without_returns_is_empty(tmp_path, suffix):
     path, points = tmp_path / f"0{suffix}", np.zeros((200, 3), np.float32)
     if suffix == ".bin":
         write_float32(path, points)
@@ -198,13 +198,13 @@ def test_a_scan_without_a_return_is_an_empty_one(tmp_path, suffix):
     assert (scan.times is not None) == (suffix in (".pcd", ".ply")) and (scan.times is None or len(scan.times) == 0)
 
 
-def test_npy_runs_no_code(tmp_path):
+def test_npy_with_pickled_objects_is_refused(tmp_path):
     np.save(tmp_path / "scan.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(DamagedFileError, match="no array of numbers"):
         read_cloud(tmp_path / "scan.npy")
 
 
-def test_fields_other_than_a_point_are_refused(tmp_path):
+def test_ply_without_coordinates_is_refused(tmp_path):
     (tmp_path / "0.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float u\nend_header\n1\n")
     with pytest.raises(DamagedFileError, match=r"0\.ply"):
         read_cloud(tmp_path / "0.ply")
@@ -226,7 +226,7 @@ def test_genuine_ply(real_data):
     assert cloud.intensities is not None and cloud.intensities.max() == 128
 
 
-def test_relative_times_of_any_unit():
+def test_relative_times_are_independent_of_unit():
     expected = torch.tensor([-0.5, 0.0, 0.5])
     for times in ([0.0, 50.0, 100.0], [1.6e9, 1.6e9 + 0.05, 1.6e9 + 0.1]):
         assert torch.allclose(relative_times(torch.tensor(times, dtype=torch.float64)), expected, atol=1e-5)

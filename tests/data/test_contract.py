@@ -11,6 +11,7 @@ from lidarlearn.data.kitti import KittiOdometry
 from lidarlearn.data.sequence import Scan
 from lidarlearn.errors import UserError
 from tests.box_world import SMALL, BoxDrives, BoxSequence
+from tests.data.datasets import findings
 from tests.data.writers import write_kitti_odometry
 
 FRAMES = 6
@@ -21,7 +22,7 @@ POINTS = torch.rand(50, 3) + 1
 
 DOUBLE_4X4, SINGLE_3 = "not a float64 tensor of (6, 4, 4)", "not a float32 tensor of (n, 3)"
 
-BROKEN = {
+INVALID = {
     "poses in single precision": ("T_world_lidar", POSES.float(), f"is a float32 tensor of (6, 4, 4), {DOUBLE_4X4}"),
     "poses of numpy": ("T_world_lidar", POSES.numpy(), f"is a float64 numpy.ndarray of (6, 4, 4), {DOUBLE_4X4}"),
     "poses in a list": ("T_world_lidar", POSES.tolist(), f"is a list, {DOUBLE_4X4}"),
@@ -38,15 +39,15 @@ BROKEN = {
 }
 
 
-class OwnSequence(BoxSequence):
-    """What a reader of one's own may give."""
+class CustomSequence(BoxSequence):
+    """A sequence of a user's reader, with an attribute replaced."""
 
     def __init__(self, name, frames, attribute, value):
         super().__init__(name, FRAMES)
         self._poses = self._poses[:frames]
         self.first = Scan(POINTS)
         if attribute in ("points", "times"):
-            object.__setattr__(self.first, attribute, value)  # past the checks of types that tests alone have
+            object.__setattr__(self.first, attribute, value)  # bypasses the type checks, which only tests have
         elif attribute is not None:
             setattr(self, attribute, value)
 
@@ -54,23 +55,24 @@ class OwnSequence(BoxSequence):
         return self.first
 
 
-class OwnDrives(BoxDrives):
-    """Drives of which sequence "1" is broken; their own `check` does not see it."""
+class CustomDrives(BoxDrives):
+    """Drives of which sequence "1" has an invalid attribute; `check` does not report it."""
 
     def __init__(self, attribute=None, value=None, frames=FRAMES):
         super().__init__(frames)
-        self.broken = (attribute, value)
+        self.invalid = (attribute, value)
 
     def sequence(self, name):
-        return OwnSequence(name, self.frames, *(self.broken if name == "1" else (None, None)))
+        return CustomSequence(name, self.frames, *(self.invalid if name == "1" else (None, None)))
 
 
-@pytest.mark.parametrize("case", BROKEN)
-def test_what_a_reader_gives_is_checked_before_work_begins(case):
-    attribute, value, said = BROKEN[case]
+@pytest.mark.parametrize("case", INVALID)
+def test_sequences_refuse_invalid_values_of_reader(case):
+    attribute, value, message = INVALID[case]
     with pytest.raises(UserError) as error:
-        OwnDrives(attribute, value).sequences(["0", "1"])
-    assert str(error.value).startswith("1: ") and said in str(error.value) and "change: its reader" in str(error.value)
+        CustomDrives(attribute, value).sequences(["0", "1"])
+    text = str(error.value)
+    assert text.startswith("1: ") and message in text and "change: its reader" in text
 
 
 @pytest.mark.parametrize(
@@ -83,28 +85,28 @@ def test_what_a_reader_gives_is_checked_before_work_begins(case):
         ("times", torch.zeros(50)),
     ],
 )
-def test_what_may_be_absent_or_of_any_type(attribute, value):
-    data = OwnDrives(attribute, value)
+def test_optional_values_may_be_absent_or_of_any_type(attribute, value):
+    data = CustomDrives(attribute, value)
     assert len(data.sequences(["0", "1"])) == 2 and data.full_check().usable
 
 
-@pytest.mark.parametrize("case", BROKEN)
-def test_the_check_tells_it_although_ones_own_does_not(case, monkeypatch, capsys):
-    attribute, value, said = BROKEN[case]
-    monkeypatch.setattr(command, "compose_data_set", lambda *_: OwnDrives(attribute, value))
-    assert OwnDrives(attribute, value).check().usable
+@pytest.mark.parametrize("case", INVALID)
+def test_check_command_reports_invalid_values_of_reader(case, monkeypatch, capsys):
+    attribute, value, message = INVALID[case]
+    monkeypatch.setattr(command, "compose_data_set", lambda *_: CustomDrives(attribute, value))
+    assert CustomDrives(attribute, value).check().usable
     assert not command.check([], Console(soft_wrap=True))
     printed = capsys.readouterr().out
-    assert said in printed and "NOT usable" in printed and printed.count("missing ") == 1
+    assert message in printed and "NOT usable" in printed and printed.count("missing ") == 1
 
 
-def test_the_check_tells_of_a_sequence_without_scans():
-    findings = [finding.detail for finding in OwnDrives(frames=0).full_check().findings if finding.level == "missing"]
-    assert len(findings) == 3 and "none of its 0 scans has a single return" in findings[0]
+def test_full_check_reports_sequence_without_scans():
+    missing = findings(CustomDrives(frames=0).full_check(), "missing").split(" | ")
+    assert len(missing) == 3 and "none of its 0 scans has a single return" in missing[0]
 
 
-def test_the_check_opens_the_sequences_of_ones_own_for_their_image(caplog):
-    data = OwnDrives()
+def test_full_check_and_sequences_warn_of_field_of_view(caplog):
+    data = CustomDrives()
     data.projection = replace(SMALL, fov_up_deg=2.0, fov_down_deg=-2.0)
     report = data.full_check()
     assert report.usable and "lie outside the image" in report.findings[0].detail
@@ -113,14 +115,14 @@ def test_the_check_opens_the_sequences_of_ones_own_for_their_image(caplog):
     assert "lie outside the image" in caplog.text
 
 
-def test_a_training_refuses_poses_that_are_not_numbers(tmp_path):
-    datamodule = OdometryDataModule(OwnDrives("T_world_lidar", LOST), cache_root=str(tmp_path))
+def test_datamodule_refuses_poses_that_are_not_finite(tmp_path):
+    datamodule = OdometryDataModule(CustomDrives("T_world_lidar", LOST), cache_root=str(tmp_path))
     with pytest.raises(UserError, match="first in that of scan 2"):
         datamodule.prepare_data()
     assert not list(tmp_path.iterdir())
 
 
-def test_sequences_that_a_check_opened_are_not_opened_again(tmp_path, monkeypatch):
+def test_full_check_opens_each_sequence_once(tmp_path, monkeypatch):
     write_kitti_odometry(tmp_path)
     opened = []
     data = KittiOdometry(tmp_path, SMALL, ["04"], ["04"], ["04"], None, False, 0.0)

@@ -1,4 +1,4 @@
-"""The datamodule: which pairs reach the network, and how."""
+"""The datamodule: batches of pairs, their labels, and where their maps are kept."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,18 +26,18 @@ def make(tmp_path, drives=None, **settings):
     return module
 
 
-def test_training_sees_every_pair_of_the_training_sequences_once_an_epoch(tmp_path):
+def test_epoch_has_each_training_pair_once(tmp_path):
     module = make(tmp_path)
     batches = list(module.train_dataloader())
     assert [len(b["index"]) for b in batches] == [4, 4, 4, 4]
     assert sorted(torch.cat([b["index"] for b in batches]).tolist()) == sorted([*range(8), *range(8)])
 
 
-def test_a_few_pairs_shared_by_two_processes_make_a_batch_of_each(tmp_path):
+def test_small_share_of_process_keeps_incomplete_batch(tmp_path):
     module = make(tmp_path, BoxDrives(frames=7, train_sequences=("0",)))
-    assert len(module.train_dataloader()) == 1  # of four, two are left over
+    assert len(module.train_dataloader()) == 1  # a batch of four; the other two pairs are dropped
     module.trainer = SimpleNamespace(world_size=2)
-    assert not module.train_dataloader().drop_last  # of three each
+    assert not module.train_dataloader().drop_last  # three pairs each
 
 
 def test_training_pairs_are_shuffled(tmp_path):
@@ -47,14 +47,14 @@ def test_training_pairs_are_shuffled(tmp_path):
     assert epochs[0] != epochs[1]
 
 
-def test_validation_sequences_come_apart_and_in_order(tmp_path):
+def test_each_validation_sequence_has_ordered_loader(tmp_path):
     module = make(tmp_path, BoxDrives(frames=9, val_sequences=("2", "4")))
     assert [s.name for s in module.val_sequences] == ["2", "4"]
     for loader in module.val_dataloader():
         assert torch.cat([b["index"] for b in loader]).tolist() == list(range(8))
 
 
-def test_batches_are_decoded_to_metres(tmp_path):
+def test_batches_are_decoded_to_metres_after_transfer(tmp_path):
     module = make(tmp_path)
     raw = next(iter(module.val_dataloader()[0]))
     batch = module.on_after_batch_transfer(raw, 0)
@@ -68,24 +68,24 @@ def test_batches_are_decoded_to_metres(tmp_path):
 @pytest.mark.parametrize(
     ("height", "width", "expected"), [(None, None, (16, 96)), (8, None, (8, 96)), (8, 48, (8, 48))]
 )
-def test_the_network_s_image_may_be_smaller_than_the_data_set_s(tmp_path, height, width, expected):
+def test_image_size_may_differ_from_data_set(tmp_path, height, width, expected):
     module = make(tmp_path, height=height, width=width)
     assert (module.projection.height, module.projection.width) == expected
     assert module.projection.fov_up_deg == SMALL.fov_up_deg
     assert next(iter(module.train_dataloader()))["reference"].shape == (4, 3, *expected)
 
 
-def test_labels_are_left_out_where_one_sequence_has_none(tmp_path):
+def test_one_sequence_without_poses_removes_labels(tmp_path):
     module = make(tmp_path, BoxDrives(frames=9, without_truth=("1",)))
     assert all("T_ref_new" not in batch for batch in module.train_dataloader())
     assert "T_ref_new" in next(iter(module.val_dataloader()[0]))
 
 
-EVERYTHING = Augmentation(mirror=True, turn=True, reverse=True, max_skip=3, drop_out=0.3)
+ALL_CHANGES = Augmentation(mirror=True, turn=True, reverse=True, max_skip=3, drop_out=0.3)
 
 
-@pytest.mark.parametrize("augmentation", [None, EVERYTHING])
-def test_batches_are_the_same_where_the_maps_are_kept_on_the_device(tmp_path, augmentation):
+@pytest.mark.parametrize("augmentation", [None, ALL_CHANGES])
+def test_resident_maps_give_equal_batches(tmp_path, augmentation):
     modules = [make(tmp_path, resident=resident, augmentation=augmentation) for resident in (False, True)]
     trained, validated = [], []
     for module in modules:
@@ -96,13 +96,13 @@ def test_batches_are_the_same_where_the_maps_are_kept_on_the_device(tmp_path, au
         for read, looked_up in zip(*batches, strict=True):
             assert read.keys() == looked_up.keys() == {"reference", "target", "index", "T_ref_new"}
             assert all(torch.equal(read[key], looked_up[key]) for key in read)
-    assert next(iter(modules[1].train_dataloader()))["reference"].shape == (4,)  # numbers alone are handed over
+    assert next(iter(modules[1].train_dataloader()))["reference"].shape == (4,)  # indices of maps
     modules[1].teardown()
     assert next(iter(modules[1].train_dataloader()))["reference"].shape == (4, 3, 16, 96)
 
 
-def test_pairs_are_changed_by_chance_in_training_alone(tmp_path):
-    plain, augmented = make(tmp_path), make(tmp_path, augmentation=EVERYTHING)
+def test_augmentation_applies_in_training_only(tmp_path):
+    plain, augmented = make(tmp_path), make(tmp_path, augmentation=ALL_CHANGES)
     for is_training in (False, True):
         augmented.trainer = SimpleNamespace(training=is_training)
         for batches in zip(plain.val_dataloader()[0], augmented.val_dataloader()[0], strict=True):
@@ -111,20 +111,20 @@ def test_pairs_are_changed_by_chance_in_training_alone(tmp_path):
 
 
 @pytest.mark.parametrize(("resident", "is_kept"), [("auto", False), (True, True), (False, False)])
-def test_maps_are_kept_on_a_cpu_only_where_that_is_asked_for(tmp_path, resident, is_kept):
+def test_maps_are_resident_on_cpu_only_if_requested(tmp_path, resident, is_kept):
     rows = next(iter(make(tmp_path, resident=resident).val_dataloader()[0]))["reference"]
     assert (rows.dim() == 1) == is_kept
 
 
 @pytest.mark.parametrize(("free", "is_kept"), [(3.0, True), (1.5, False)])
-def test_maps_are_kept_on_a_gpu_where_they_take_less_than_half_of_it(tmp_path, monkeypatch, free, is_kept):
+def test_maps_are_resident_if_below_half_of_free_memory(tmp_path, monkeypatch, free, is_kept):
     module = make(tmp_path)
     monkeypatch.setattr("lidarlearn.data.datamodule._free_memory", lambda _: int(free * module._maps.nbytes))
     module.keep_maps_on(torch.device("cpu"))
     assert (next(iter(module.val_dataloader()[0]))["reference"].dim() == 1) == is_kept
 
 
-def test_the_disk_is_found_too_small_before_the_first_sequence_is_projected(tmp_path, monkeypatch):
+def test_full_disk_is_refused_before_projection(tmp_path, monkeypatch):
     one = 9 * 3 * SMALL.height * SMALL.width * 2
     usage = SimpleNamespace(free=50_000_000 + 2 * one)
     monkeypatch.setattr("lidarlearn.data.cache.shutil.disk_usage", lambda _: usage)
@@ -133,7 +133,7 @@ def test_the_disk_is_found_too_small_before_the_first_sequence_is_projected(tmp_
     assert not list(tmp_path.rglob("vertex_maps.npy"))
 
 
-def test_maps_that_do_not_fit_are_told(tmp_path, monkeypatch):
+def test_out_of_memory_error_names_setting(tmp_path, monkeypatch):
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory")
 
@@ -144,7 +144,7 @@ def test_maps_that_do_not_fit_are_told(tmp_path, monkeypatch):
         module.keep_maps_on(torch.device("cpu"))
 
 
-def test_another_word_than_auto_is_refused(tmp_path):
+def test_invalid_resident_setting_is_refused(tmp_path):
     with pytest.raises(ValueError, match="true, false or auto, got 'always'"):
         make(tmp_path, resident="always")
 
@@ -152,7 +152,7 @@ def test_another_word_than_auto_is_refused(tmp_path):
 @pytest.mark.filterwarnings(
     "ignore:This process:DeprecationWarning"
 )  # fork beside torch's threads, from Python 3.12 on
-def test_workers_load_the_same(tmp_path):
+def test_workers_load_equal_batches(tmp_path):
     plain, loaded = make(tmp_path), make(tmp_path, num_workers=2)
     for a, b in zip(plain.val_dataloader()[0], loaded.val_dataloader()[0], strict=True):
         torch.testing.assert_close(a["reference"], b["reference"])
@@ -160,16 +160,16 @@ def test_workers_load_the_same(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("num_workers", [0, 2])
-def test_validation_leaves_the_stream_of_random_numbers_alone(tmp_path, num_workers):
-    """Else how often workers have started would decide about the next epoch's batches."""
+def test_validation_leaves_random_state_unchanged(tmp_path, num_workers):
+    """Otherwise the batches of the next epoch would depend on how often workers were started."""
     module = make(tmp_path, num_workers=num_workers)
     state = torch.get_rng_state()
     list(module.val_dataloader()[0])
     assert torch.equal(state, torch.get_rng_state())
 
 
-class WithoutTheLast(BoxDrives):
-    """Its last sequence, for validation, is not there."""
+class LastSequenceMissing(BoxDrives):
+    """The sequence for validation is missing."""
 
     def sequence(self, name):
         if name == self.val_sequences[-1]:
@@ -177,26 +177,26 @@ class WithoutTheLast(BoxDrives):
         return super().sequence(name)
 
 
-def test_what_is_missing_is_told_before_anything_is_projected(tmp_path):
+def test_missing_sequence_is_reported_before_projection(tmp_path):
     with pytest.raises(DataSetNotFoundError, match="sequence 2"):
-        make(tmp_path, WithoutTheLast(frames=9))
+        make(tmp_path, LastSequenceMissing(frames=9))
     assert not list(tmp_path.rglob("*.npy"))
 
 
-def test_missing_labels_are_told_before_anything_is_projected(tmp_path):
+def test_missing_labels_are_reported_before_projection(tmp_path):
     config = configured(tmp_path / "run", "loss=supervised", frames=9, without_truth=["1", "2"])
     with pytest.raises(UserError, match=r"there is none of 1, 2"):
         train(config, data_name="boxes")
     assert not list((tmp_path / "cache").rglob("*.npy"))
 
 
-def test_nothing_to_train_on_is_an_error_that_names_the_setting(tmp_path):
+def test_empty_training_split_error_names_setting(tmp_path):
     with pytest.raises(UserError, match=r"data\.train_sequences"):
         make(tmp_path, BoxDrives(frames=9, train_sequences=()))
 
 
 @on_gpu
-def test_a_gpu_keeps_the_maps_and_gives_the_same_batches(tmp_path):
+def test_maps_on_gpu_give_equal_batches(tmp_path):
     batches = []
     for device in ("cpu", "cuda"):
         module = make(tmp_path)

@@ -1,4 +1,4 @@
-"""Whether scans fit the image of their sensor."""
+"""Whether scans fit the projection of their sensor."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation import sensors
 from tests.box_world import SMALL, BoxDrives
 
-IMAGES = sorted(path.stem for path in (config_directory() / "projection").glob("*.yaml"))
+PROJECTIONS = sorted(path.stem for path in (config_directory() / "projection").glob("*.yaml"))
 SENSORS = {
     "hdl64": sensors.hdl64(64),
     "hdl32": sensors.hdl32(64),
@@ -23,27 +23,27 @@ SENSORS = {
 }
 
 
-def image(name):
+def projection(name):
     with initialize_config_dir(str(config_directory().absolute()), version_base="1.3"):
         return instantiate(compose(overrides=[f"+projection={name}"]).projection)
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_a_sensor_fits_its_own_image(name):
+def test_sensor_fits_its_own_projection(name):
     points = torch.from_numpy(SENSORS[name].directions(0).reshape(-1, 3) * 20)
-    assert field_of_view_warning("drive", points, image(name)) is None
+    assert field_of_view_warning("drive", points, projection(name)) is None
 
 
-def test_a_wrong_image_is_told_with_what_would_be_right():
+def test_warning_states_field_of_view_and_projections():
     points = torch.from_numpy(sensors.os1_64(64).directions(0).reshape(-1, 3) * 20)
-    points = torch.cat([points, torch.zeros(9000, 3)])  # those that did not return do not count
-    remark = field_of_view_warning("drive", points, image("hdl64"))
+    points = torch.cat([points, torch.zeros(9000, 3)])  # points without a return are not counted
+    remark = field_of_view_warning("drive", points, projection("hdl64"))
     assert remark is not None
     assert "44 % of the points of drive's first scan" in remark and "+3 to -24 deg" in remark
-    assert "from +21 to -21 deg" in remark and all(name in remark for name in IMAGES)
+    assert "from +21 to -21 deg" in remark and all(name in remark for name in PROJECTIONS)
 
 
-def test_opening_sequences_warns_once(caplog):
+def test_sequences_warn_once(caplog):
     data = BoxDrives(frames=3)
     assert list(data.sequences(["0", "1"])) == ["0", "1"] and not caplog.records
     data.projection = SphericalProjection(SMALL.height, SMALL.width, fov_up_deg=2.0, fov_down_deg=-20.0)
@@ -63,7 +63,7 @@ def test_opening_sequences_warns_once(caplog):
         (["data=folder", "projection@data.projection=hdl32"], "hdl32_pair", "hdl32_pair"),
     ],
 )
-def test_genuine_scans_fit_the_images_of_their_sensors(real_data, data, root, sequence):
+def test_genuine_scans_fit_projections_of_their_sensors(real_data, data, root, sequence):
     data_set = compose_data_set([*data, f"data.root={real_data / root}"])
     points = data_set.sequence(sequence).scan(0).points
     assert field_of_view_warning(sequence, points, data_set.projection) is None
@@ -71,7 +71,7 @@ def test_genuine_scans_fit_the_images_of_their_sensors(real_data, data, root, se
 
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", ["ouster_mcd", "hdl32_pair"])
-def test_genuine_scans_of_other_sensors_do_not_fit_the_default(real_data, name):
+def test_check_reports_genuine_scans_outside_projection(real_data, name):
     data = Folder(real_data / name, SphericalProjection())
     odd = " ".join(finding.detail for finding in data.check().findings if finding.level == "odd")
     assert data.check().usable and "lie outside the image" in odd

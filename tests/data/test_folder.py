@@ -20,7 +20,7 @@ def write_scans(directory, names=("1.bin", "2.bin", "10.bin")):
         write_float32(directory / name, random_points(i))
 
 
-def test_every_subfolder_is_a_sequence(tmp_path):
+def test_each_subfolder_is_a_sequence(tmp_path):
     for name in ("run_10", "run_9"):
         write_scans(tmp_path / name)
     (tmp_path / "notes").mkdir()
@@ -30,7 +30,7 @@ def test_every_subfolder_is_a_sequence(tmp_path):
     assert len(data.sequence("run_9")) == 3
 
 
-def test_scans_beside_folders_of_scans_are_not_left_out_in_silence(tmp_path, caplog):
+def test_scans_beside_subfolders_are_reported_as_left_out(tmp_path, caplog):
     write_scans(tmp_path / "drive")
     write_scans(tmp_path / "drive" / "maps", ["GlobalMap.bin"])
     data = folder(tmp_path / "drive")
@@ -44,7 +44,7 @@ def test_scans_beside_folders_of_scans_are_not_left_out_in_silence(tmp_path, cap
     assert "left out" not in findings(chosen.check(), "odd") + caplog.text
 
 
-def test_a_folder_given_by_dots_has_its_own_name(tmp_path, monkeypatch):
+def test_relative_root_is_named_after_folder(tmp_path, monkeypatch):
     write_scans(tmp_path / "drive")
     (tmp_path / "drive" / "notes" / "more").mkdir(parents=True)
     (tmp_path / "drive.txt").write_text(kitti_rows(curve(3)))
@@ -56,7 +56,7 @@ def test_a_folder_given_by_dots_has_its_own_name(tmp_path, monkeypatch):
     assert folder("..").check().remedy == f"data.root={tmp_path / 'drive'}"
 
 
-def test_the_folder_itself_is_a_sequence_in_natural_order(tmp_path):
+def test_root_with_scans_is_one_sequence_in_natural_order(tmp_path):
     write_scans(tmp_path / "drive")
     data = folder(tmp_path / "drive")
     assert data.test_sequences == ("drive",)
@@ -68,7 +68,7 @@ def test_the_folder_itself_is_a_sequence_in_natural_order(tmp_path):
     assert sequence.T_world_lidar is None and sequence.timestamps is None
 
 
-def test_point_times_and_intensities(tmp_path):
+def test_pcd_has_point_times_and_intensities(tmp_path):
     (tmp_path / "drive").mkdir()
     write_pcd(tmp_path / "drive" / "0.pcd", random_points(0), TIMES)
     scan = folder(tmp_path, max_intensity=200).sequence("drive").scan(0)
@@ -77,7 +77,7 @@ def test_point_times_and_intensities(tmp_path):
 
 
 @pytest.mark.parametrize(("stamps", "share"), [(None, 1.0), ("0\n0.1\n0.2\n", 0.5), ("0\n0.2\n0.4\n", 0.25)])
-def test_scan_times_tell_what_share_of_a_period_the_points_take(tmp_path, stamps, share):
+def test_point_times_are_shares_of_scan_period(tmp_path, stamps, share):
     (tmp_path / "drive").mkdir()
     for i in range(3):
         write_pcd(tmp_path / "drive" / f"{i}.pcd", random_points(0), np.linspace(2e7, 7e7, 200).astype(np.uint32))
@@ -87,7 +87,7 @@ def test_scan_times_tell_what_share_of_a_period_the_points_take(tmp_path, stamps
     assert times is not None and np.allclose(times, share * np.linspace(-0.5, 0.5, 200), atol=1e-6)
 
 
-def test_npy_of_named_fields_has_its_share_of_the_period_too(tmp_path):
+def test_point_times_of_npy_are_shares_of_scan_period(tmp_path):
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive" / "times.txt").write_text("0\n0.2\n")
     for i in range(2):
@@ -97,8 +97,8 @@ def test_npy_of_named_fields_has_its_share_of_the_period_too(tmp_path):
     assert np.allclose(times, 0.495 * np.linspace(-0.5, 0.5, 200), atol=1e-6)
 
 
-def test_points_off_the_image_may_be_read_in_wrong_columns(tmp_path):
-    """nuScenes' files have a fifth number to a point, its ring."""
+def test_check_suggests_bin_columns_for_points_outside_image(tmp_path):
+    """Files of nuScenes have a fifth number per point, the ring."""
     points = random_points(0)
     points[:, 2] = -np.abs(points[:, 2])
     (tmp_path / "bin").mkdir()
@@ -111,7 +111,7 @@ def test_points_off_the_image_may_be_read_in_wrong_columns(tmp_path):
     assert "outside the image" not in findings(folder(tmp_path / "bin", bin_columns=5).check(), "odd")
 
 
-def test_deskewing_needs_point_times(tmp_path):
+def test_deskewing_requires_point_times(tmp_path):
     write_scans(tmp_path / "without")
     (tmp_path / "zero").mkdir()
     write_pcd(tmp_path / "zero" / "0.pcd", random_points(0), 0 * TIMES)
@@ -126,7 +126,7 @@ def test_deskewing_needs_point_times(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["drive/poses.txt", "drive/groundtruth.txt", "drive.txt"])
-def test_kitti_ground_truth(tmp_path, name):
+def test_kitti_ground_truth_is_found_beside_scans(tmp_path, name):
     write_scans(tmp_path / "drive")
     (tmp_path / name).write_text(kitti_rows(curve(5)[2:]))
     expected = np.linalg.inv(curve(3)[2]) @ curve(5)[2:]
@@ -135,7 +135,7 @@ def test_kitti_ground_truth(tmp_path, name):
     assert len(cut) == len(cut.T_world_lidar) == 2
 
 
-def test_tum_ground_truth_by_time(tmp_path):
+def test_tum_ground_truth_is_interpolated_at_scan_times(tmp_path):
     write_scans(tmp_path / "drive")
     (tmp_path / "drive.tum").write_text(tum_rows(curve(6), 0.2 * np.arange(6)))
     (tmp_path / "drive" / "times.txt").write_text("0.2\n0.5\n0.8\n")
@@ -147,7 +147,7 @@ def test_tum_ground_truth_by_time(tmp_path):
     assert sequence.timestamps.tolist() == [0.2, 0.5, 0.8]
 
 
-def test_tum_ground_truth_in_order_where_scans_have_no_times(tmp_path):
+def test_tum_ground_truth_without_scan_times_is_in_order(tmp_path):
     write_scans(tmp_path / "drive")
     (tmp_path / "drive" / "poses.tum").write_text(tum_rows(curve(3), [5.0, 6.0, 7.0]))
     assert np.allclose(folder(tmp_path).sequence("drive").T_world_lidar, curve(3), atol=1e-8)
@@ -166,7 +166,7 @@ def test_tum_ground_truth_in_order_where_scans_have_no_times(tmp_path):
         ("times.txt", "0\n2\n1\n", "do not ascend"),
     ],
 )
-def test_damaged_ground_truth_and_times(tmp_path, file, content, problem):
+def test_damaged_ground_truth_or_times_are_reported(tmp_path, file, content, problem):
     write_scans(tmp_path / "drive")
     (tmp_path / "drive" / file).write_bytes(content.encode("latin-1"))
     with pytest.raises(DamagedFileError, match=problem):
@@ -174,7 +174,7 @@ def test_damaged_ground_truth_and_times(tmp_path, file, content, problem):
     assert not folder(tmp_path).check().usable
 
 
-def test_clocks_that_do_not_agree(tmp_path):
+def test_ground_truth_of_other_clock_is_refused(tmp_path):
     write_scans(tmp_path / "drive")
     (tmp_path / "drive" / "poses.tum").write_text(tum_rows(curve(3), [5.0, 6.0, 7.0]))
     (tmp_path / "drive" / "times.txt").write_text("0.2\n0.5\n0.8\n")
@@ -182,7 +182,7 @@ def test_clocks_that_do_not_agree(tmp_path):
         folder(tmp_path).sequence("drive")
 
 
-def test_scans_that_the_ground_truth_does_not_cover_are_left_out(tmp_path, caplog):
+def test_scans_outside_ground_truth_are_dropped(tmp_path, caplog):
     write_scans(tmp_path / "drive")
     (tmp_path / "drive" / "times.txt").write_text("1\n2\n3\n")
     (tmp_path / "drive" / "poses.tum").write_text(
@@ -194,7 +194,7 @@ def test_scans_that_the_ground_truth_does_not_cover_are_left_out(tmp_path, caplo
     assert "drive: 2 scans before or after the ground truth are left out" in caplog.text
 
 
-def test_scans_of_several_kinds(tmp_path):
+def test_scans_of_several_kinds_are_refused(tmp_path):
     write_scans(tmp_path / "drive")
     write_pcd(tmp_path / "drive" / "0.pcd", random_points(0), TIMES)
     with pytest.raises(UserError, match="several kinds"):
@@ -202,7 +202,7 @@ def test_scans_of_several_kinds(tmp_path):
     assert not folder(tmp_path).check().usable
 
 
-def test_missing_scans(tmp_path):
+def test_missing_scans_are_reported(tmp_path):
     with pytest.raises(DataSetNotFoundError, match=r"data\.root"):
         folder(tmp_path / "nowhere").sequence("nowhere")
     assert not folder(tmp_path / "nowhere").check().usable
@@ -211,7 +211,7 @@ def test_missing_scans(tmp_path):
     assert folder(tmp_path).check().remedy == f"data.root={tmp_path / 'deep' / 'er'}"
 
 
-def test_of_many_sequences_a_few_are_named(tmp_path):
+def test_error_lists_at_most_five_sequences(tmp_path):
     for i in range(9):
         write_scans(tmp_path / f"run {i}")
     with pytest.raises(DataSetNotFoundError, match=r"\(run 0, run 1, run 2, run 3, run 4, \.\.\.\)"):
@@ -220,7 +220,7 @@ def test_of_many_sequences_a_few_are_named(tmp_path):
     assert "run 4" in remedy and "run 5" not in remedy
 
 
-def test_check(tmp_path):
+def test_check_reports_ground_truth_and_truncated_scan(tmp_path):
     write_scans(tmp_path / "drive")
     report = folder(tmp_path).check()
     assert report.usable and "no ground truth" in findings(report, "odd")
@@ -231,7 +231,7 @@ def test_check(tmp_path):
     assert not report.usable and "2.bin (17 bytes)" in findings(report, "missing")
 
 
-def test_fingerprint_follows_the_settings(tmp_path):
+def test_fingerprint_depends_on_settings(tmp_path):
     write_scans(tmp_path / "drive")
     settings = ({}, {"beam_correction_deg": 0.1}, {"bin_columns": 5}, {"max_intensity": 255})
     assert len({folder(tmp_path, **s).sequence("drive").fingerprint for s in settings}) == 4

@@ -25,13 +25,13 @@ def test_round_trip(tmp_path):
     sequence = ford(tmp_path).sequence(NAME)
     assert len(sequence) == 4
     for scan, points in zip(sequence, written.points, strict=True):
-        assert torch.equal(scan.points, torch.from_numpy(points))  # turned, and the truck itself left out
+        assert torch.equal(scan.points, torch.from_numpy(points))  # axes are converted, returns of the truck left out
         assert scan.times is None and scan.intensities is None
     assert np.allclose(sequence.T_world_lidar, written.T_world_lidar, atol=1e-9)
     assert np.allclose(sequence.timestamps - sequence.timestamps[0], 0.1 * np.arange(4), atol=1e-5)
 
 
-def test_minimum_range_and_beam_correction_change_scan_and_fingerprint(tmp_path):
+def test_min_range_and_beam_correction_change_fingerprint(tmp_path):
     written = write_ford_campus(tmp_path)
     default, near, raised = (
         ford(tmp_path, **settings).sequence(NAME)
@@ -42,7 +42,7 @@ def test_minimum_range_and_beam_correction_change_scan_and_fingerprint(tmp_path)
     assert len({s.fingerprint for s in (default, near, raised)}) == 3
 
 
-def test_a_laser_mounted_elsewhere_on_the_vehicle(tmp_path):
+def test_extrinsics_move_poses_to_lidar(tmp_path):
     written = write_ford_campus(tmp_path)
     mounting = np.diag([1.0, -1.0, -1.0, 1.0])
     mounting[:3, 3] = 2.4, -0.01, -2.3
@@ -50,7 +50,7 @@ def test_a_laser_mounted_elsewhere_on_the_vehicle(tmp_path):
     assert np.allclose(T, np.linalg.inv(mounting) @ written.T_world_lidar @ mounting, atol=1e-9)
 
 
-def test_poses_are_kept_until_the_scans_change(tmp_path, monkeypatch):
+def test_poses_are_cached_until_scans_change(tmp_path, monkeypatch):
     write_ford_campus(tmp_path)
     first = ford(tmp_path).sequence(NAME).T_world_lidar
     reads = []
@@ -63,7 +63,7 @@ def test_poses_are_kept_until_the_scans_change(tmp_path, monkeypatch):
     assert len(reads) == 3
 
 
-def test_a_damaged_file_of_kept_poses_is_ignored(tmp_path):
+def test_damaged_pose_cache_is_ignored(tmp_path):
     written = write_ford_campus(tmp_path)
     ford(tmp_path).sequence(NAME)
     (tmp_path / NAME / "lidarlearn_poses.npz").write_bytes(b"PK")
@@ -71,7 +71,7 @@ def test_a_damaged_file_of_kept_poses_is_ignored(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", None])
-def test_a_damaged_scan(tmp_path, content):
+def test_damaged_scan_is_reported(tmp_path, content):
     write_ford_campus(tmp_path)
     path = scan_file(tmp_path)
     path.write_bytes(path.read_bytes()[:1500] if content is None else content)
@@ -79,7 +79,7 @@ def test_a_damaged_scan(tmp_path, content):
         ford(tmp_path).sequence(NAME)
 
 
-def test_an_empty_scan_is_found_by_the_check(tmp_path):
+def test_check_reports_empty_scan_file(tmp_path):
     write_ford_campus(tmp_path)
     scan_file(tmp_path).write_bytes(b"")
     report = ford(tmp_path).check()
@@ -95,7 +95,7 @@ def test_an_empty_scan_is_found_by_the_check(tmp_path):
         ({"SCAN": {"timestamp_laser": [[1.0]], "X_wv": np.full((6, 1), np.nan)}}, "not finite"),
     ],
 )
-def test_scans_without_what_is_needed(tmp_path, content, problem):
+def test_scan_without_required_fields_is_refused(tmp_path, content, problem):
     write_ford_campus(tmp_path)
     savemat(scan_file(tmp_path), content)
     with pytest.raises(DamagedFileError, match=problem):
@@ -105,7 +105,7 @@ def test_scans_without_what_is_needed(tmp_path, content, problem):
 @pytest.mark.parametrize(
     ("points", "problem"), [(np.full((3, 5), np.nan), "finite"), (np.zeros((3, 0)), "XYZ|without")]
 )
-def test_scans_without_points(tmp_path, points, problem):
+def test_scan_without_points_is_refused(tmp_path, points, problem):
     write_ford_campus(tmp_path)
     savemat(scan_file(tmp_path), {"SCAN": {"timestamp_laser": [[1.0]], "X_wv": np.zeros((6, 1)), "XYZ": points}})
     with pytest.raises(DamagedFileError, match=problem):
@@ -113,7 +113,7 @@ def test_scans_without_points(tmp_path, points, problem):
 
 
 @pytest.mark.parametrize("gone", [f"{NAME}/SCANS", NAME])
-def test_missing_parts_are_named(tmp_path, gone):
+def test_missing_folder_is_reported(tmp_path, gone):
     write_ford_campus(tmp_path)
     (tmp_path / gone).rename(tmp_path / "elsewhere")
     with pytest.raises(DataSetNotFoundError, match=r"Ford Campus[\s\S]*data\.root"):
@@ -121,13 +121,13 @@ def test_missing_parts_are_named(tmp_path, gone):
     assert not ford(tmp_path).check().usable
 
 
-def test_the_right_level_is_suggested(tmp_path):
+def test_check_suggests_correct_root(tmp_path):
     write_ford_campus(tmp_path / "root")
     assert ford(tmp_path / "root" / NAME).check().remedy == f"data.root={tmp_path / 'root'}"
     assert ford(tmp_path).check().remedy == f"data.root={tmp_path / 'root'}"
 
 
-def test_further_sequences_and_gaps_are_listed(tmp_path):
+def test_check_lists_further_sequences_and_gaps(tmp_path):
     write_ford_campus(tmp_path, frames=8)
     write_ford_campus(tmp_path, name="IJRR-Dataset-2")
     scan_file(tmp_path).unlink()
@@ -137,7 +137,7 @@ def test_further_sequences_and_gaps_are_listed(tmp_path):
     assert "gaps in the numbering: 76" in findings(report, "odd")
 
 
-def test_check_reads_one_scan_and_keeps_no_poses(tmp_path, monkeypatch):
+def test_check_reads_one_scan_and_caches_no_poses(tmp_path, monkeypatch):
     write_ford_campus(tmp_path)
     reads = []
     read_scan = ford_campus.read_scan
@@ -149,7 +149,7 @@ def test_check_reads_one_scan_and_keeps_no_poses(tmp_path, monkeypatch):
     assert "no MATLAB file with a structure SCAN" in findings(ford(tmp_path).check(), "missing")
 
 
-def test_deskewing_compensated_scans_is_refused(tmp_path):
+def test_deskewing_of_compensated_scans_is_refused(tmp_path):
     write_ford_campus(tmp_path)
     with pytest.raises(UserError, match=r"data\.deskew=false"):
         ford(tmp_path, deskew=True).sequence(NAME)

@@ -31,19 +31,19 @@ def test_round_trip(tmp_path):
     assert np.allclose(sequence.timestamps, 0.1 * np.arange(5))
 
 
-def test_beams_are_corrected_by_default(tmp_path):
+def test_beam_correction_is_on_by_default(tmp_path):
     written = write_kitti_odometry(tmp_path)
     points = kitti(tmp_path).sequence("04").scan(1).points
     assert torch.equal(points, raise_beams(torch.from_numpy(written.points[1]), 0.205))
 
 
-def test_fingerprint_follows_the_correction(tmp_path):
+def test_fingerprint_depends_on_beam_correction(tmp_path):
     write_kitti_odometry(tmp_path)
     a, b = (kitti(tmp_path, beam_correction_deg=angle).sequence("04").fingerprint for angle in (0.0, 0.205))
     assert a != b
 
 
-def test_a_partial_copy_takes_its_rows_by_number(tmp_path):
+def test_partial_copy_selects_rows_by_scan_number(tmp_path):
     written = write_kitti_odometry(tmp_path)
     for number in (0, 1, 4):
         (tmp_path / f"sequences/04/velodyne/{number:06d}.bin").unlink()
@@ -55,7 +55,7 @@ def test_a_partial_copy_takes_its_rows_by_number(tmp_path):
     assert kitti(tmp_path).check().usable
 
 
-def test_max_frames_and_pickling(tmp_path):
+def test_sequence_with_max_frames_can_be_pickled(tmp_path):
     write_kitti_odometry(tmp_path)
     sequence = kitti(tmp_path, max_frames=2).sequence("04")
     copy = pickle.loads(pickle.dumps(sequence))
@@ -63,7 +63,7 @@ def test_max_frames_and_pickling(tmp_path):
     assert torch.equal(copy.scan(1).points, sequence.scan(1).points)
 
 
-def test_a_gap_is_logged_and_found_odd(tmp_path, caplog):
+def test_gap_in_numbering_is_reported(tmp_path, caplog):
     write_kitti_odometry(tmp_path)
     (tmp_path / "sequences/04/velodyne/000002.bin").unlink()
     assert len(kitti(tmp_path).sequence("04")) == 4
@@ -72,7 +72,7 @@ def test_a_gap_is_logged_and_found_odd(tmp_path, caplog):
     assert report.usable and "1 gaps in the numbering: 2" in findings(report, "odd")
 
 
-def test_without_poses_there_is_no_ground_truth(tmp_path):
+def test_missing_poses_are_reported(tmp_path):
     write_kitti_odometry(tmp_path)
     (tmp_path / "poses/04.txt").unlink()
     assert kitti(tmp_path).sequence("04").T_world_lidar is None
@@ -82,7 +82,7 @@ def test_without_poses_there_is_no_ground_truth(tmp_path):
 
 
 @pytest.mark.parametrize("gone", ["sequences/04/calib.txt", "sequences/04/velodyne", "sequences/04", "sequences"])
-def test_missing_parts_are_named(tmp_path, gone):
+def test_missing_parts_are_reported(tmp_path, gone):
     write_kitti_odometry(tmp_path)
     (tmp_path / gone).rename(tmp_path / "elsewhere")
     with pytest.raises(DataSetNotFoundError, match=r"KITTI[\s\S]*data\.root"):
@@ -91,7 +91,7 @@ def test_missing_parts_are_named(tmp_path, gone):
 
 
 @pytest.mark.parametrize("level", ["root/sequences", "root/sequences/04", "."])
-def test_the_right_level_is_suggested(tmp_path, level):
+def test_correct_root_is_suggested(tmp_path, level):
     write_kitti_odometry(tmp_path / "root")
     data = kitti(tmp_path / level)
     with pytest.raises(DataSetNotFoundError, match=rf"data\.root={tmp_path / 'root'}"):
@@ -100,7 +100,7 @@ def test_the_right_level_is_suggested(tmp_path, level):
     assert not report.usable and report.remedy == f"data.root={tmp_path / 'root'}"
 
 
-def test_fewer_poses_than_scans(tmp_path):
+def test_fewer_poses_than_scans_are_refused(tmp_path):
     write_kitti_odometry(tmp_path)
     poses = tmp_path / "poses/04.txt"
     poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:3]))
@@ -110,7 +110,7 @@ def test_fewer_poses_than_scans(tmp_path):
     assert not report.usable and "3 poses in 04.txt, fewer than the 5" in findings(report, "missing")
 
 
-def test_a_nan_pose_and_an_empty_pose_file(tmp_path):
+def test_nan_pose_and_empty_pose_file_are_refused(tmp_path):
     write_kitti_odometry(tmp_path)
     poses = tmp_path / "poses/04.txt"
     poses.write_text(kitti_rows(np.where(np.arange(5)[:, None, None] == 3, np.nan, np.eye(4))))
@@ -121,7 +121,7 @@ def test_a_nan_pose_and_an_empty_pose_file(tmp_path):
         kitti(tmp_path).sequence("04")
 
 
-def test_a_truncated_scan(tmp_path):
+def test_truncated_scan_is_reported(tmp_path):
     write_kitti_odometry(tmp_path)
     path = tmp_path / "sequences/04/velodyne/000003.bin"
     path.write_bytes(path.read_bytes()[:-5])
@@ -132,7 +132,7 @@ def test_a_truncated_scan(tmp_path):
     assert not report.usable and "000003.bin (3195 bytes)" in findings(report, "missing")
 
 
-def test_a_small_scan_is_odd(tmp_path):
+def test_check_reports_small_scan(tmp_path):
     write_kitti_odometry(tmp_path)
     path = tmp_path / "sequences/04/velodyne/000003.bin"
     path.write_bytes(path.read_bytes()[:160])
@@ -141,14 +141,14 @@ def test_a_small_scan_is_odd(tmp_path):
 
 
 @pytest.mark.parametrize("calibration", ["", "P0: 1\n", "Tr: 1 2 3\n", "Tr: a\n"])
-def test_a_damaged_calibration(tmp_path, calibration):
+def test_damaged_calibration_is_refused(tmp_path, calibration):
     write_kitti_odometry(tmp_path)
     (tmp_path / "sequences/04/calib.txt").write_text(calibration)
     with pytest.raises(DamagedFileError, match=r"calib\.txt"):
         kitti(tmp_path).sequence("04")
 
 
-def test_deskewing_compensated_scans_is_refused(tmp_path):
+def test_deskewing_of_compensated_scans_is_refused(tmp_path):
     write_kitti_odometry(tmp_path)
     with pytest.raises(UserError, match=r"data\.deskew=false"):
         kitti(tmp_path, deskew=True).sequence("04")
@@ -162,7 +162,7 @@ def test_check_lists_missing_and_further_sequences(tmp_path):
     assert "(04)" in report.remedy
 
 
-def test_check_looks_at_names_and_sizes_only(tmp_path, monkeypatch):
+def test_check_opens_no_damaged_scans(tmp_path, monkeypatch):
     folder = tmp_path / "sequences/00/velodyne"
     folder.mkdir(parents=True)
     for i in range(1000):
@@ -173,7 +173,7 @@ def test_check_looks_at_names_and_sizes_only(tmp_path, monkeypatch):
     assert "1000 empty or truncated" in findings(report, "missing")
 
 
-def test_only_kitti_s_own_names_are_scans(tmp_path):
+def test_files_of_other_names_are_no_scans(tmp_path):
     written = write_kitti_odometry(tmp_path)
     velodyne = tmp_path / "sequences/04/velodyne"
     for stray in ("000002 (1).bin", "scan.bin", "0000003.bin"):
@@ -186,7 +186,7 @@ def test_only_kitti_s_own_names_are_scans(tmp_path):
     assert "'0000003.bin', '000002 (1).bin', 'scan.bin'" in findings(report, "odd")
 
 
-def test_an_absent_sequence_says_what_is_there_and_which_setting_names_it(tmp_path):
+def test_error_for_missing_sequence_names_setting_and_others(tmp_path):
     write_kitti_odometry(tmp_path, "04")
     data = kitti(tmp_path, val_sequences=["09"])
     with pytest.raises(DataSetNotFoundError, match=r"change: +data\.val_sequences to .*\(04\), or data\.root"):
@@ -203,7 +203,7 @@ def test_an_absent_sequence_says_what_is_there_and_which_setting_names_it(tmp_pa
         ("poses/04.txt", b"1 2 3\n" * 5, "3 numbers in a row"),
     ],
 )
-def test_check_opens_what_looks_whole(tmp_path, file, content, problem):
+def test_check_reports_unreadable_text_files(tmp_path, file, content, problem):
     write_kitti_odometry(tmp_path)
     (tmp_path / file).write_bytes(content)
     with pytest.raises(DamagedFileError, match=problem):
@@ -212,7 +212,7 @@ def test_check_opens_what_looks_whole(tmp_path, file, content, problem):
     assert not report.usable and problem in findings(report, "missing")
 
 
-def test_check_knows_that_nothing_is_to_deskew(tmp_path):
+def test_check_reports_deskewing_of_compensated_scans(tmp_path):
     write_kitti_odometry(tmp_path)
     report = kitti(tmp_path, deskew=True).check()
     assert not report.usable and "data.deskew=false" in findings(report, "missing")

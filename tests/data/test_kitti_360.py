@@ -30,13 +30,13 @@ def test_round_trip(tmp_path):
     assert kitti_360(tmp_path).deskew
 
 
-def test_poses_that_are_missing_are_interpolated(tmp_path):
+def test_missing_poses_are_interpolated(tmp_path):
     written = write_kitti_360(tmp_path, without_pose=(2, 3))
     sequence = kitti_360(tmp_path).sequence("0003")
     assert np.allclose(sequence.T_world_lidar, written.T_world_lidar, atol=1e-6)
 
 
-def test_scans_before_the_first_pose_are_left_out_and_said_so(tmp_path, caplog):
+def test_scans_outside_ground_truth_are_dropped(tmp_path, caplog):
     written = write_kitti_360(tmp_path, without_pose=(0, 5))
     sequence = kitti_360(tmp_path).sequence("0003")
     assert len(sequence) == 4 and "2 scans before or after" in caplog.text
@@ -44,7 +44,7 @@ def test_scans_before_the_first_pose_are_left_out_and_said_so(tmp_path, caplog):
     assert torch.equal(sequence.scan(0).points, torch.from_numpy(written.points[1]))
 
 
-def test_without_ground_truth(tmp_path):
+def test_missing_ground_truth_is_reported(tmp_path):
     write_kitti_360(tmp_path)
     poses_file(tmp_path).unlink()
     sequence = kitti_360(tmp_path).sequence("0003")
@@ -63,21 +63,21 @@ def test_without_ground_truth(tmp_path):
         ("3 " + "1 " * 12 + "\n", "at least two"),
     ],
 )
-def test_damaged_poses(tmp_path, content, problem):
+def test_damaged_poses_are_refused(tmp_path, content, problem):
     write_kitti_360(tmp_path)
     poses_file(tmp_path).write_text(content)
     with pytest.raises(DamagedFileError, match=problem):
         kitti_360(tmp_path).sequence("0003")
 
 
-def test_damaged_calibration(tmp_path):
+def test_damaged_calibration_is_refused(tmp_path):
     write_kitti_360(tmp_path)
     (tmp_path / "calibration" / "calib_cam_to_pose.txt").write_text("image_02: 1 2 3\n")
     with pytest.raises(DamagedFileError, match="image_00"):
         kitti_360(tmp_path).sequence("0003")
 
 
-def test_a_truncated_scan(tmp_path):
+def test_truncated_scan_is_reported(tmp_path):
     write_kitti_360(tmp_path)
     path = tmp_path / "data_3d_raw" / DRIVE / "velodyne_points" / "data" / "0000000002.bin"
     path.write_bytes(path.read_bytes()[:-3])
@@ -86,7 +86,7 @@ def test_a_truncated_scan(tmp_path):
     assert "truncated" in findings(kitti_360(tmp_path).check(), "missing")
 
 
-def test_what_is_missing_is_named(tmp_path):
+def test_missing_parts_are_reported(tmp_path):
     with pytest.raises(DataSetNotFoundError, match="KITTI-360"):
         kitti_360(tmp_path / "nowhere").sequence("0003")
     write_kitti_360(tmp_path)

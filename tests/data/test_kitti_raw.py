@@ -39,13 +39,13 @@ def test_round_trip(tmp_path):
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.015, -0.02])
-def test_poses_are_those_of_the_middle_of_the_sweep_whenever_the_packets_came(tmp_path, lag):
+def test_poses_are_at_middle_of_sweep_for_any_packet_lag(tmp_path, lag):
     written = write_kitti_raw(tmp_path, lag=lag)
     T = raw(tmp_path).sequence(DRIVE).T_world_lidar
     assert np.allclose(T, written.T_world_lidar, atol=1e-4)  # Mercator's scale changes along the way
 
 
-def test_dropped_scans_keep_their_numbers(tmp_path, caplog):
+def test_scans_around_gap_keep_their_numbers(tmp_path, caplog):
     written = write_kitti_raw(tmp_path, dropped=(2, 3))
     sequence = raw(tmp_path).sequence(DRIVE)
     assert len(sequence) == 4 and "1 gaps" in caplog.text
@@ -54,14 +54,14 @@ def test_dropped_scans_keep_their_numbers(tmp_path, caplog):
     assert report.usable and "gaps in the numbering: 2-3" in findings(report, "odd")
 
 
-def test_sweep_times_run_clockwise_from_the_rear():
+def test_sweep_times_increase_clockwise_from_rear():
     forward, right, left = [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]
     rear_left, rear_right = [-1.0, 1e-6, 0.0], [-1.0, -1e-6, 0.0]
     times = sweep_times(torch.tensor([rear_left, left, forward, right, rear_right]))
     assert torch.allclose(times, torch.tensor([-0.5, -0.25, 0.0, 0.25, 0.5]), atol=1e-6)
 
 
-def test_odometry_numbers_select_the_part_of_the_drive(tmp_path):
+def test_odometry_sequence_selects_part_of_drive(tmp_path):
     drive, numbers = ODOMETRY_DRIVES["08"], (0, 1, 1099, 1100, 5170, 5171)
     write_kitti_raw(tmp_path, drive=drive.name, frames=6)
     scans = tmp_path / drive.name[:10] / f"{drive.name}_sync" / "velodyne_points"
@@ -75,14 +75,14 @@ def test_odometry_numbers_select_the_part_of_the_drive(tmp_path):
     assert data.sequence(drive.name).scans.numbers == [*numbers]
 
 
-def test_mercator_is_true_to_scale_at_the_first_latitude():
+def test_mercator_has_unit_scale_at_first_latitude():
     position = mercator(np.array([49.0, 49.0001, 49.0]), np.array([8.4, 8.4, 8.4001]), np.array([100.0, 100.0, 101.0]))
     north, east = position[1] - position[0], position[2] - position[0]
     assert north == pytest.approx([0, np.radians(1e-4) * 6378137, 0], abs=1e-3)
     assert east == pytest.approx([np.radians(1e-4) * 6378137 * np.cos(np.radians(49)), 0, 1], abs=1e-3)
 
 
-def test_without_gps_there_is_no_ground_truth(tmp_path):
+def test_missing_packets_are_reported(tmp_path):
     write_kitti_raw(tmp_path)
     (folder(tmp_path) / "oxts").rename(tmp_path / "elsewhere")
     assert raw(tmp_path).sequence(DRIVE).T_world_lidar is None
@@ -100,7 +100,7 @@ def test_without_gps_there_is_no_ground_truth(tmp_path):
         f"{DRIVE}_sync",
     ],
 )
-def test_missing_parts_are_named(tmp_path, gone):
+def test_missing_parts_are_reported(tmp_path, gone):
     write_kitti_raw(tmp_path)
     (tmp_path / "2011_09_26" / gone).rename(tmp_path / "elsewhere")
     with pytest.raises(DataSetNotFoundError, match=r"KITTI raw[\s\S]*data\.root"):
@@ -109,7 +109,7 @@ def test_missing_parts_are_named(tmp_path, gone):
 
 
 @pytest.mark.parametrize("level", ["root/2011_09_26", "."])
-def test_the_right_level_is_suggested(tmp_path, level):
+def test_check_suggests_correct_root(tmp_path, level):
     write_kitti_raw(tmp_path / "root")
     assert raw(tmp_path / level).check().remedy == f"data.root={tmp_path / 'root'}"
 
@@ -128,14 +128,14 @@ def test_the_right_level_is_suggested(tmp_path, level):
         ("../calib_imu_to_velo.txt", "R: 1 2\nT: 1\n", "nine"),
     ],
 )
-def test_damaged_files(tmp_path, file, content, problem):
+def test_damaged_files_are_refused(tmp_path, file, content, problem):
     write_kitti_raw(tmp_path)
     (folder(tmp_path) / file).write_text(content)
     with pytest.raises(DamagedFileError, match=problem):
         raw(tmp_path).sequence(DRIVE)
 
 
-def test_packets_on_both_sides_of_the_scans_are_read_and_no_others(tmp_path, monkeypatch):
+def test_only_packets_around_scans_are_read(tmp_path, monkeypatch):
     write_kitti_raw(tmp_path, frames=10, lag=-0.02)
     for number in range(3):
         (folder(tmp_path) / "velodyne_points" / "data" / f"{number:010d}.bin").unlink()
@@ -146,7 +146,7 @@ def test_packets_on_both_sides_of_the_scans_are_read_and_no_others(tmp_path, mon
     assert [packets.numbers for packets in read] == [[3, 4], [3, 4, 5]]
 
 
-def test_scans_without_packets_have_no_ground_truth_made_up(tmp_path, caplog):
+def test_scans_outside_packets_are_dropped(tmp_path, caplog):
     written = write_kitti_raw(tmp_path, frames=20)
     packets = folder(tmp_path) / "oxts" / "data"
     for number in (0, 1, *range(12, 20)):
@@ -161,7 +161,7 @@ def test_scans_without_packets_have_no_ground_truth_made_up(tmp_path, caplog):
     assert report.usable and "10 GPS/IMU packets for scans numbered up to 19" in findings(report, "odd")
 
 
-def test_scans_in_a_hole_of_the_packets_are_told(tmp_path, caplog):
+def test_gap_of_packets_is_logged(tmp_path, caplog):
     write_kitti_raw(tmp_path, frames=40)
     for number in range(5, 35):
         (folder(tmp_path) / "oxts" / "data" / f"{number:010d}.txt").unlink()
@@ -169,7 +169,7 @@ def test_scans_in_a_hole_of_the_packets_are_told(tmp_path, caplog):
     assert "31 scans lie in holes of the ground truth" in caplog.text
 
 
-def test_a_truncated_scan(tmp_path):
+def test_truncated_scan_is_reported(tmp_path):
     write_kitti_raw(tmp_path)
     path = folder(tmp_path) / "velodyne_points/data/0000000001.bin"
     path.write_bytes(path.read_bytes()[:-3])
@@ -188,7 +188,7 @@ def test_files_of_other_names_are_no_scans_or_packets(tmp_path):
     assert "'0000000002_copy.bin'" in findings(raw(tmp_path).check(), "odd")
 
 
-def test_a_drive_of_kitti_odometry_is_found_under_its_number(tmp_path):
+def test_check_finds_drive_by_odometry_sequence(tmp_path):
     write_kitti_raw(tmp_path, drive=ODOMETRY_DRIVES["04"].name)
     report = raw(tmp_path, name="04").check()
     assert report.usable and "not among the configured" not in findings(report, "found")
@@ -208,7 +208,7 @@ def test_genuine_drive_0009(real_data):
 
 @pytest.mark.slow
 @pytest.mark.realdata
-def test_ground_truth_of_drive_0009_agrees_with_registered_scans(real_data):
+def test_ground_truth_of_drive_0009_agrees_with_registration(real_data):
     sequence = raw(real_data / "kitti_raw").sequence(DRIVE)
     differences = []
     for i in range(2, 30, 9):
@@ -218,4 +218,4 @@ def test_ground_truth_of_drive_0009_agrees_with_registered_scans(real_data):
         reference.insert(ref, torch.eye(4, dtype=torch.float64), frames=1)
         registered = GaussNewton().register(new[grid_sample(new, 1.0)], reference, T_ref_new, search_distance_m=0.5)
         differences.append(float((torch.linalg.inv(T_ref_new) @ registered.T_world_lidar)[:3, 3].norm()))
-    assert np.median(differences) < 0.04  # a packet taken as it stands, or at the start of the sweep, is 0.05 and more
+    assert np.median(differences) < 0.04  # 0.05 and more without interpolation, or at the start of the sweep

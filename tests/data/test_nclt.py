@@ -26,21 +26,21 @@ def test_round_trip(tmp_path, height):
     assert len(sequence) == 5
     for scan, points in zip(sequence, written.points, strict=True):
         assert np.allclose(scan.points, points, atol=1e-5)
-        assert scan.points[0, 0] == pytest.approx(80, abs=0.003)  # not wrapped
+        assert scan.points[0, 0] == pytest.approx(80, abs=0.003)  # no overflow
         assert scan.times is None
         assert scan.intensities is not None and torch.allclose(scan.intensities, torch.tensor(0.2))
     assert np.allclose(sequence.T_world_lidar, written.T_world_lidar, atol=1e-6)
     assert np.allclose(sequence.timestamps - sequence.timestamps[0], 0.1 * np.arange(5), atol=1e-5)
 
 
-def test_ground_truth_may_lie_beside_the_dates(tmp_path):
+def test_ground_truth_folder_beside_dates_is_found(tmp_path):
     written = write_nclt(tmp_path)
     (tmp_path / "ground_truth").mkdir()
     truth_file(tmp_path).rename(tmp_path / "ground_truth" / truth_file(tmp_path).name)
     assert np.allclose(nclt(tmp_path).sequence(DATE).T_world_lidar, written.T_world_lidar, atol=1e-6)
 
 
-def test_nan_rows_are_dropped(tmp_path):
+def test_nan_rows_of_ground_truth_are_dropped(tmp_path):
     written = write_nclt(tmp_path)
     lines = truth_file(tmp_path).read_text().splitlines()
     lines[12] = lines[12].split(",")[0] + ", nan" * 6
@@ -49,7 +49,7 @@ def test_nan_rows_are_dropped(tmp_path):
     assert T.isfinite().all() and np.allclose(T, written.T_world_lidar, atol=1e-6)
 
 
-def test_scans_outside_the_ground_truth_are_left_out_and_said_so(tmp_path, caplog):
+def test_scans_outside_ground_truth_are_dropped(tmp_path, caplog):
     written = write_nclt(tmp_path)
     lines = truth_file(tmp_path).read_text().splitlines()
     truth_file(tmp_path).write_text("\n".join(lines[8:35]) + "\n")  # from 70 ms to 330 ms
@@ -60,7 +60,7 @@ def test_scans_outside_the_ground_truth_are_left_out_and_said_so(tmp_path, caplo
     assert np.allclose(sequence.scan(0).points, written.points[1], atol=1e-5)
 
 
-def test_scans_in_a_hole_of_the_ground_truth_are_reported(tmp_path, caplog):
+def test_gap_of_ground_truth_is_logged(tmp_path, caplog):
     write_nclt(tmp_path)
     first = int(truth_file(tmp_path).read_text().splitlines()[1].split(",")[0])
     rows = [f"{first}, 0, 0, 0, 0, 0, 0", f"{first + 3_000_000}, 1, 0, 0, 0, 0, 0"]
@@ -69,7 +69,7 @@ def test_scans_in_a_hole_of_the_ground_truth_are_reported(tmp_path, caplog):
     assert "holes of the ground truth" in caplog.text
 
 
-def test_without_ground_truth(tmp_path):
+def test_missing_ground_truth_is_reported(tmp_path):
     write_nclt(tmp_path)
     truth_file(tmp_path).unlink()
     sequence = nclt(tmp_path).sequence(DATE)
@@ -88,21 +88,21 @@ def test_without_ground_truth(tmp_path):
         ("1, 0, 0, 0, 0, 0, 0\n2, 0, 0, 0, 0, 0, 0\n", "do not overlap"),
     ],
 )
-def test_damaged_ground_truth(tmp_path, content, problem):
+def test_damaged_ground_truth_is_refused(tmp_path, content, problem):
     write_nclt(tmp_path)
     truth_file(tmp_path).write_text(content)
     with pytest.raises(DamagedFileError, match=problem):
         nclt(tmp_path).sequence(DATE)
 
 
-def test_an_empty_csv_is_found_by_the_check(tmp_path):
+def test_check_reports_empty_ground_truth(tmp_path):
     write_nclt(tmp_path)
     truth_file(tmp_path).write_text("")
     report = nclt(tmp_path).check()
     assert not report.usable and "empty ground truth" in findings(report, "missing")
 
 
-def test_a_truncated_scan(tmp_path):
+def test_truncated_scan_is_reported(tmp_path):
     write_nclt(tmp_path)
     path = nclt(tmp_path).sequence(DATE).scans.path(2)
     path.write_bytes(path.read_bytes()[:-3])
@@ -113,7 +113,7 @@ def test_a_truncated_scan(tmp_path):
 
 
 @pytest.mark.parametrize("gone", [f"{DATE}/velodyne_sync", DATE])
-def test_missing_parts_are_named(tmp_path, gone):
+def test_missing_folder_is_reported(tmp_path, gone):
     write_nclt(tmp_path)
     (tmp_path / gone).rename(tmp_path / "elsewhere")
     with pytest.raises(DataSetNotFoundError, match=r"NCLT[\s\S]*data\.root"):
@@ -122,30 +122,30 @@ def test_missing_parts_are_named(tmp_path, gone):
 
 
 @pytest.mark.parametrize("level", [f"root/{DATE}", f"root/{DATE}/velodyne_sync", "."])
-def test_the_right_level_is_suggested(tmp_path, level):
+def test_check_suggests_correct_root(tmp_path, level):
     write_nclt(tmp_path / "root")
     assert nclt(tmp_path / level).check().remedy == f"data.root={tmp_path / 'root'}"
 
 
-def test_deskewing_compensated_scans_is_refused(tmp_path):
+def test_deskewing_of_compensated_scans_is_refused(tmp_path):
     write_nclt(tmp_path)
     with pytest.raises(UserError, match=r"data\.deskew=false"):
         nclt(tmp_path, deskew=True).sequence(DATE)
 
 
 @pytest.mark.realdata
-def test_the_genuine_scan(real_data):
+def test_genuine_scan(real_data):
     data = nclt(real_data / "nclt")
     sequence = data.sequence("2012-01-15")
     points = sequence.scan(0).points
     assert len(points) == 23546
     assert points.norm(dim=1).max() < 100
-    assert (points[:, 0] > 63.84).float().mean() == pytest.approx(0.00055, abs=0.00001)  # read as signed: none
+    assert (points[:, 0] > 63.84).float().mean() == pytest.approx(0.00055, abs=0.00001)  # 0 if read as signed
     rows = np.fromfile(sequence.scans.path(0), POINT)
     assert sorted(np.unique(rows["laser"])) == list(range(32))
     near = points[points[:, :2].norm(dim=1) < 8]
     assert near[:, 2].median() == pytest.approx(-1.03, abs=0.1)  # the ground is below
-    # In its own centre every beam has the elevation of the HDL-32's data sheet, upside down.
+    # The elevations of the beams are those of the HDL-32's data sheet, upside down.
     elevation = np.degrees(np.arctan2(points[:, 2].numpy(), points[:, :2].norm(dim=1).numpy()))
     medians = sorted(np.median(elevation[rows["laser"] == laser]) for laser in range(32))
     assert np.allclose(medians, np.linspace(-10.67, 30.67, 32), atol=0.02)

@@ -25,13 +25,13 @@ def test_round_trip(tmp_path):
         assert torch.equal(scan.points, torch.from_numpy(points))
         columns = np.arange(0, 65536, 300) // 64
         assert torch.allclose(scan.times, torch.from_numpy(columns / 1024 - 0.5).float())
-    # by half a sweep later than the stamps; a constant twist makes the relative poses those of the curve
+    # Poses are half a sweep later than the stamps; with a constant twist the relative poses are those of the curve.
     assert np.allclose(sequence.T_world_lidar, written.T_world_lidar, atol=1e-5)
     assert np.allclose(sequence.timestamps - sequence.timestamps[0], 0.1 * np.arange(4), atol=1e-6)
     assert newer_college(tmp_path).deskew
 
 
-def test_a_scan_without_all_columns_has_no_times(tmp_path):
+def test_scan_with_missing_columns_has_no_times(tmp_path):
     write_newer_college(tmp_path)
     path = sorted((tmp_path / WALK / "raw_format" / "ouster_scan").iterdir())[0]
     content = path.read_bytes().replace(b"WIDTH 1024", b"WIDTH 1023").replace(b"POINTS 65536", b"POINTS 65472")
@@ -39,14 +39,14 @@ def test_a_scan_without_all_columns_has_no_times(tmp_path):
     assert any(scan.times is None for scan in newer_college(tmp_path).sequence(WALK))
 
 
-def test_without_ground_truth(tmp_path):
+def test_missing_ground_truth_is_reported(tmp_path):
     write_newer_college(tmp_path)
     truth_file(tmp_path).unlink()
     assert newer_college(tmp_path).sequence(WALK).T_world_lidar is None
     assert "no ground truth" in findings(newer_college(tmp_path).check(), "missing")
 
 
-def test_scans_outside_the_ground_truth_are_left_out_and_said_so(tmp_path, caplog):
+def test_scans_outside_ground_truth_are_dropped(tmp_path, caplog):
     write_newer_college(tmp_path)
     lines = truth_file(tmp_path).read_text().splitlines()
     truth_file(tmp_path).write_text("\n".join([lines[0], *lines[4:8]]) + "\n")
@@ -67,14 +67,14 @@ def test_scans_outside_the_ground_truth_are_left_out_and_said_so(tmp_path, caplo
         ("1,0,0,0,0,0,0,0,1\n2,0,0,0,0,0,0,0,1\n", "do not overlap"),
     ],
 )
-def test_damaged_ground_truth(tmp_path, content, problem):
+def test_damaged_ground_truth_is_refused(tmp_path, content, problem):
     write_newer_college(tmp_path)
     truth_file(tmp_path).write_text(content)
     with pytest.raises(DamagedFileError, match=problem):
         newer_college(tmp_path).sequence(WALK)
 
 
-def test_a_file_of_another_name(tmp_path):
+def test_file_of_other_name_is_no_scan(tmp_path):
     write_newer_college(tmp_path)
     path = sorted((tmp_path / WALK / "raw_format" / "ouster_scan").iterdir())[0]
     path.rename(path.with_name("cloud.pcd"))
@@ -82,7 +82,7 @@ def test_a_file_of_another_name(tmp_path):
     assert "'cloud.pcd'" in findings(newer_college(tmp_path).check(), "odd")
 
 
-def test_what_is_missing_is_named(tmp_path):
+def test_missing_data_and_wrong_root_are_reported(tmp_path):
     with pytest.raises(DataSetNotFoundError, match="Newer College"):
         newer_college(tmp_path / "nowhere").sequence(WALK)
     write_newer_college(tmp_path)

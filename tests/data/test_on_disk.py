@@ -10,7 +10,7 @@ from lidarlearn.data.sequence import Scan
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cropped(SequenceOnDisk):
-    """A reader of the user's, with a setting that is no plain value."""
+    """A sequence of a user's reader, with a setting that is not a scalar."""
 
     box_m: tuple[float, float]
 
@@ -19,7 +19,7 @@ class Cropped(SequenceOnDisk):
 
 
 @pytest.mark.parametrize("setting", [{"box_m": (0.0, 9.0)}, {"beam_correction_deg": 0.2}])
-def test_the_fingerprint_follows_every_setting_but_not_what_is_no_part_of_a_scan(setting, tmp_path):
+def test_fingerprint_depends_on_settings_of_scans_only(setting, tmp_path):
     sequence = Cropped(
         name="drive", scans=ScanFiles(tmp_path, (), ()), T_world_lidar=None, timestamps=None, beam_correction_deg=0.0,
         box_m=(0.0, 5.0),

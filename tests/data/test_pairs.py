@@ -34,7 +34,7 @@ def vertex_maps(sequences, tmp_path):
 ROWS = (range(5), range(5, 6), range(6, 9))
 
 
-def test_consecutive_scans_and_the_motion_between_them(sequences, poses, vertex_maps):
+def test_pairs_are_consecutive_scans_with_relative_pose(sequences, poses, vertex_maps):
     pairs = ScanPairs(ROWS, poses)
     assert len(pairs) == 6
     batch = with_maps(pairs.__getitems__([5, 0, 1, 2, 3, 4]), vertex_maps)
@@ -46,7 +46,7 @@ def test_consecutive_scans_and_the_motion_between_them(sequences, poses, vertex_
         torch.testing.assert_close(moved, poses[sequence][i + 1])
 
 
-def test_maps_in_memory_are_those_of_the_files(poses, vertex_maps):
+def test_maps_in_memory_equal_those_of_files(poses, vertex_maps):
     batch = ScanPairs(ROWS, poses).__getitems__([4, 2])
     resident = vertex_maps.to(torch.device("cpu"))
     assert len(resident) == len(vertex_maps) == 9
@@ -54,18 +54,18 @@ def test_maps_in_memory_are_those_of_the_files(poses, vertex_maps):
         assert torch.equal(with_maps(batch, resident)[key], with_maps(batch, vertex_maps)[key])
 
 
-def test_no_ground_truth_no_label():
+def test_pairs_without_ground_truth_have_no_label():
     assert "T_ref_new" not in ScanPairs(ROWS, None).__getitems__([0])
 
 
-def test_poses_that_do_not_belong_to_the_scans_are_refused(poses):
+def test_missing_or_nan_poses_are_refused(poses):
     with pytest.raises(ValueError, match="finite ground-truth poses, got 4, 4 of them finite"):
         ScanPairs(ROWS, [poses[0][:-1], *poses[1:]])
     with pytest.raises(ValueError, match="got 5, 0 of them finite"):
         ScanPairs(ROWS, [poses[0] * torch.nan, *poses[1:]])
 
 
-def test_a_pair_may_skip_scans_but_not_beyond_the_last_of_its_sequence(poses):
+def test_skips_stay_within_sequence(poses):
     pairs = ScanPairs(ROWS, poses, max_skip=4)
     torch.manual_seed(0)
     seen = set()
@@ -77,7 +77,7 @@ def test_a_pair_may_skip_scans_but_not_beyond_the_last_of_its_sequence(poses):
     assert seen == {(0, 1), (0, 2), (0, 3), (0, 4), (2, 3), (2, 4), (6, 7), (6, 8)}
 
 
-def test_steps_are_spread_evenly():
+def test_skips_are_uniformly_distributed():
     pairs = ScanPairs([range(400)], None, max_skip=3)
     torch.manual_seed(0)
     batch = pairs.__getitems__(list(range(300)))
@@ -85,7 +85,7 @@ def test_steps_are_spread_evenly():
     assert set(counts) == {1, 2, 3} and min(counts.values()) > 70
 
 
-def test_nothing_is_left_to_chance_without_skips():
+def test_pairs_without_skips_draw_no_random_numbers():
     state = torch.get_rng_state()
     ScanPairs([range(400)], None).__getitems__([3])
     assert torch.equal(state, torch.get_rng_state())

@@ -28,14 +28,14 @@ def test_tum_round_trip(tmp_path):
         ("0\n0.2\n0.1\n0.3\n", "do not ascend, the first is in row 3"),
     ],
 )
-def test_damaged_times(tmp_path, content, problem):
+def test_damaged_times_are_refused(tmp_path, content, problem):
     (tmp_path / "times.txt").write_text(content)
     with pytest.raises(DamagedFileError, match=problem):
         read_times(tmp_path / "times.txt")
 
 
-def test_a_byte_order_mark_is_no_number(tmp_path):
-    """Editors on Windows begin a file with one."""
+def test_byte_order_mark_is_skipped(tmp_path):
+    """As written by editors on Windows."""
     (tmp_path / "times.txt").write_text("0.5\n1\n", encoding="utf-8-sig")
     assert read_times(tmp_path / "times.txt").tolist() == [0.5, 1]
 
@@ -50,7 +50,7 @@ def test_a_byte_order_mark_is_no_number(tmp_path):
         (kitti_rows(curve(2)) + " ".join(["nan"] * 12) + "\n", "the first is row 3"),
     ],
 )
-def test_damaged_kitti_poses(tmp_path, content, problem):
+def test_damaged_kitti_poses_are_refused(tmp_path, content, problem):
     (tmp_path / "00.txt").write_text(content)
     with pytest.raises(DamagedFileError, match=problem):
         read_kitti_poses(tmp_path / "00.txt")
@@ -63,20 +63,20 @@ def test_damaged_kitti_poses(tmp_path, content, problem):
         ("1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 1\n", "quaternion"),
     ],
 )
-def test_damaged_tum_poses(tmp_path, content, problem):
+def test_damaged_tum_poses_are_refused(tmp_path, content, problem):
     (tmp_path / "00.txt").write_text(content)
     with pytest.raises(DamagedFileError, match=problem):
         read_tum_poses(tmp_path / "00.txt")
 
 
-def test_start_at_identity_keeps_the_motion():
+def test_start_at_identity_keeps_relative_poses():
     poses = torch.from_numpy(curve(5))
     moved = start_at_identity(poses[2:])
     assert torch.equal(moved[0], torch.eye(4).double())
     assert torch.allclose(moved[1], torch.linalg.inv(poses[2]) @ poses[3])
 
 
-def test_interpolation_is_exact_on_a_constant_twist_and_beyond_its_ends():
+def test_interpolation_is_exact_for_constant_twist():
     poses, fine = torch.from_numpy(curve(4)), curve(2)
     times = torch.tensor([10.0, 10.1, 10.2, 10.3], dtype=torch.float64)
     half = torch.tensor([10.05, 10.15, 10.3, 10.35, 9.95], dtype=torch.float64)

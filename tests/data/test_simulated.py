@@ -69,8 +69,8 @@ def test_sequences_have_different_worlds(made):
 
 def test_scans_do_not_depend_on_number_of_workers(made, tmp_path):
     other = _data_set(tmp_path, workers=2)
-    other.prepare(["urban_00"])  # shared by both
-    other.prepare()  # a drive for each
+    other.prepare(["urban_00"])  # one drive for both workers
+    other.prepare()  # one drive for each worker
     assert _bytes(other) == _bytes(made)
 
 

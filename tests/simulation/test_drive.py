@@ -173,7 +173,7 @@ def test_motion_distortion_shifts_points_by_their_times():
     )
     assert still.times is None and bent.times is not None
     assert bent.times.min() >= -0.5 and bent.times.max() < 0.5 and len(bent.times) == len(bent.points)
-    # The walls across the path, at 24 and -36 m, seen by every column from where it was fired.
+    # Walls across the path at 24 and -36 m; each column measures from its own pose.
     x, y, z = bent.points.T
     at_scan_pose = x + 2.0 * bent.times
     across = (y.abs() < 6) & (z.abs() < 1.5)
