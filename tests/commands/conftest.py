@@ -4,11 +4,34 @@ import sys
 
 import numpy as np
 import pytest
+import torchvision
+from torch import nn
 
 from lidarlearn.commands import evaluate
 from lidarlearn.data.pose_files import write_kitti_poses
 from tests.box_world import BoxSequence
 from tests.commands.scans import FRAMES, SENSOR
+
+
+class SmallBackbone(nn.Module):
+    """As torchvision's residual networks to PoseNet, with few parameters."""
+
+    def __init__(self, name: str, weights: None, num_classes: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, 32, kernel_size=7)  # replaced by PoseNet
+        self.conv2 = nn.Conv2d(32, 32, kernel_size=3, stride=2, padding=1)
+        self.fc = nn.Linear(32, num_classes)
+
+    def forward(self, x):
+        return self.fc(self.conv2(self.conv1(x).relu()).relu().mean(dim=(2, 3)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def small_backbone():
+    """Training, saving and loading ResNet-18 would take most of the time, and commands do the same with any network."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torchvision.models, "get_model", SmallBackbone)
+        yield
 
 
 @pytest.fixture(scope="session")

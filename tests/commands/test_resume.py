@@ -1,4 +1,4 @@
-"""With `ckpt=...`, `train.py` and `evaluate.py` take from the checkpoint what the command line leaves out."""
+"""`ckpt=...`: train.py and evaluate.py take settings from the checkpoint unless the command line gives them."""
 
 import functools
 import operator
@@ -34,7 +34,7 @@ RUN = (
 
 
 def run(folder, root, *arguments):
-    """Run train.py with all that is of this machine rather than of the training; the last checkpoint."""
+    """Run train.py; the last checkpoint. The settings added here depend on the machine and may differ on resuming."""
     own = ["device=cpu", f"data.root={root}", f"datamodule.cache_root={folder.parent}/cache",
            "datamodule.num_workers=0", "datamodule.preparation_workers=0", "trainer.log_every_n_steps=1",
            "~callbacks.images", "~callbacks.trajectories", f"hydra.run.dir={folder}"]  # fmt: skip
@@ -46,12 +46,12 @@ def run(folder, root, *arguments):
 
 @pytest.fixture(scope="module")
 def checkpoint(scans, tmp_path_factory):
-    """Of a finished training that is configured like no default."""
+    """The checkpoint of a finished training, with settings that all differ from the defaults."""
     return run(tmp_path_factory.mktemp("runs") / "run", scans, *RUN)
 
 
 def composed(folder: Path, checkpoint: Path, *overrides: str, program: str = "train"):
-    """What a command line with `ckpt=...` composes into."""
+    """The config of a command line with `ckpt=...`."""
     shutil.rmtree(folder, ignore_errors=True)
     arguments = ["x.py", f"ckpt={checkpoint}", "run_dir=x", *overrides]
     (add_settings if program == "train" else add_data)(arguments, folder)
@@ -59,18 +59,18 @@ def composed(folder: Path, checkpoint: Path, *overrides: str, program: str = "tr
         return compose(program, arguments[1:])
 
 
-def option_of_the_user(tmp_path: Path, name: str, content: str) -> str:
-    """Write an option into a folder beside the project's; the override by which it is found."""
+def user_option(tmp_path: Path, name: str, content: str) -> str:
+    """Write an option into a folder of the user; the override that adds the folder to the search path."""
     place = tmp_path / "my, options" / name
     place.parent.mkdir(parents=True)
     place.write_text(content)
     return f"hydra.searchpath=['file://{tmp_path}/my, options']"
 
 
-def test_a_training_goes_on_as_it_was_configured(checkpoint, tmp_path, monkeypatch):
+def test_resumed_training_keeps_its_settings(checkpoint, tmp_path, monkeypatch):
     monkeypatch.setenv("LIDARLEARN_DATA", "/elsewhere")
     config = composed(tmp_path / "o", checkpoint)
-    assert config.data.root == "/elsewhere/folder"  # as on this machine
+    assert config.data.root == "/elsewhere/folder"  # that of this machine
     assert config.data.train_sequences == ["0"] and config.data.projection.fov_up_deg == 15.0
     assert (config.datamodule.batch_size, config.datamodule.height, config.seed) == (2, 16, 7)
     assert config.loss["_target_"].endswith("IcpLoss") and config.module["_target_"].endswith("UnsupervisedModule")
@@ -80,8 +80,8 @@ def test_a_training_goes_on_as_it_was_configured(checkpoint, tmp_path, monkeypat
     assert (config.trainer.max_epochs, config.trainer.limit_train_batches) == (2, 2)
 
 
-def test_a_run_is_called_by_the_data_of_its_checkpoint(checkpoint, tmp_path, monkeypatch):
-    """Not by the option through which they are chosen."""
+def test_data_name_is_that_of_the_checkpoint(checkpoint, tmp_path, monkeypatch):
+    """And not "checkpoint", the option that holds its data settings."""
     names = []
     for command, name in ((train, "train"), (evaluate, "evaluate")):
         monkeypatch.setattr(command, name, lambda config, data_name: names.append(data_name) or checkpoint)
@@ -90,7 +90,7 @@ def test_a_run_is_called_by_the_data_of_its_checkpoint(checkpoint, tmp_path, mon
     assert names == ["folder", "folder"]
 
 
-def test_settings_of_the_module_are_kept_and_can_be_changed(checkpoint, tmp_path):
+def test_module_settings_are_kept_unless_overridden(checkpoint, tmp_path):
     content = torch.load(checkpoint, weights_only=True)
     content["hyper_parameters"]["compile_loss"] = False
     torch.save(content, tmp_path / "eager.ckpt")
@@ -99,8 +99,8 @@ def test_settings_of_the_module_are_kept_and_can_be_changed(checkpoint, tmp_path
 
 
 @pytest.mark.parametrize("program", ["train", "evaluate"])
-def test_an_experiment_that_chooses_no_data_leaves_them_to_the_checkpoint(checkpoint, tmp_path, program):
-    folder = option_of_the_user(tmp_path, "experiment/seeded.yaml", "# @package _global_\nseed: 3\n")
+def test_experiment_without_data_takes_them_from_checkpoint(checkpoint, tmp_path, program):
+    folder = user_option(tmp_path, "experiment/seeded.yaml", "# @package _global_\nseed: 3\n")
     overrides = [folder, "experiment=seeded"]
     config = composed(tmp_path / "o", checkpoint, *overrides, program=program)
     assert (config.seed, config.data.max_frames) == (3, FRAMES)
@@ -110,14 +110,14 @@ def test_an_experiment_that_chooses_no_data_leaves_them_to_the_checkpoint(checkp
 
 
 @pytest.mark.parametrize(("program", "add"), [("train", add_settings), ("evaluate", add_data)])
-def test_flags_may_stand_behind_the_overrides(checkpoint, tmp_path, program, add):
+def test_flags_may_follow_overrides(checkpoint, tmp_path, program, add):
     arguments = [f"{program}.py", f"ckpt={checkpoint}", "seed=0,1", "-m", "--config-dir", "mine"]
     add(arguments, tmp_path / "o")
     assert arguments[-3:] == ["-m", "--config-dir", "mine"] and "recipe=checkpoint" in arguments[1:-3]
 
 
 @pytest.mark.parametrize("order", [["recipe=paper", "CKPT"], ["CKPT", "recipe=paper"]])
-def test_the_recipe_of_the_checkpoint_comes_after_another(checkpoint, tmp_path, order):
+def test_recipe_of_checkpoint_wins_over_another_recipe(checkpoint, tmp_path, order):
     arguments = ["train.py", *(f"ckpt={checkpoint}" if word == "CKPT" else word for word in order), "run_dir=x"]
     add_settings(arguments, tmp_path / "o")
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
@@ -125,7 +125,7 @@ def test_the_recipe_of_the_checkpoint_comes_after_another(checkpoint, tmp_path, 
     assert config.datamodule.batch_size == 2 and config.data.max_frames == FRAMES
 
 
-def test_a_schedule_without_milestones_goes_on_too_and_what_it_left_to_defaults_is_no_change(checkpoint, tmp_path):
+def test_omitted_scheduler_arguments_count_as_their_defaults(checkpoint, tmp_path):
     content = torch.load(checkpoint, weights_only=True)
     parts = content["hyper_parameters"]
     parts["scheduler"] = {"_target_": "lidarlearn.training.schedules.WarmUpCosine", "total_steps": None}
@@ -141,7 +141,7 @@ def test_a_schedule_without_milestones_goes_on_too_and_what_it_left_to_defaults_
         require_resumable(tmp_path / "cosine.ckpt", module, trainer)
 
 
-def test_the_command_line_and_experiments_come_after_the_checkpoint(checkpoint, tmp_path):
+def test_command_line_and_experiment_override_checkpoint(checkpoint, tmp_path):
     config = composed(tmp_path / "o", checkpoint, "datamodule.batch_size=3", "data.max_frames=4", "data=folder")
     assert (config.datamodule.batch_size, config.data.max_frames) == (3, 4)
     config = composed(tmp_path / "o", checkpoint, "experiment=network/simulated_mapping")
@@ -150,15 +150,14 @@ def test_the_command_line_and_experiments_come_after_the_checkpoint(checkpoint, 
     assert config.loss["_target_"].endswith("WeightedIcpLoss")
 
 
-@pytest.mark.parametrize("program", ["train", "evaluate"])
 @pytest.mark.parametrize("folder", ["t m,p", "t=(1)", "John Doe's", 'a"b', "a\\b\\", "[x]{y: z}", "é"])
-def test_options_are_found_wherever_temporary_files_lie(checkpoint, tmp_path, folder, program):
-    assert composed(tmp_path / folder, checkpoint, program=program).data.max_frames == FRAMES
+def test_temporary_folder_may_have_any_name(checkpoint, tmp_path, folder):
+    assert composed(tmp_path / folder, checkpoint).data.max_frames == FRAMES
 
 
 @pytest.mark.parametrize("program", ["train", "evaluate"])
-def test_options_of_the_user_are_found_too(checkpoint, tmp_path, program):
-    folder = option_of_the_user(tmp_path, "projection/mine.yaml", "defaults: [hdl64@_here_, _self_]\nheight: 17\n")
+def test_search_path_of_the_user_is_kept(checkpoint, tmp_path, program):
+    folder = user_option(tmp_path, "projection/mine.yaml", "defaults: [hdl64@_here_, _self_]\nheight: 17\n")
     overrides = [folder, "projection@data.projection=mine"]
     config = composed(tmp_path / "o", checkpoint, *overrides, "data=folder", program=program)
     assert config.data.projection.height == 17
@@ -167,24 +166,24 @@ def test_options_of_the_user_are_found_too(checkpoint, tmp_path, program):
 
 
 @pytest.mark.parametrize(("program", "remedy"), [("train", "one at a time$"), ("evaluate", r"add data=\.\.\.$")])
-def test_several_checkpoints_at_once_are_refused(tmp_path, program, remedy):
+def test_sweep_over_checkpoints_is_refused(tmp_path, program, remedy):
     with pytest.raises(UserError, match=remedy):
         composed(tmp_path / "o", Path("a.ckpt,b.ckpt"), program=program)
 
 
-def test_the_last_checkpoint_on_a_command_line_counts():
+def test_last_of_two_checkpoints_counts():
     assert given_checkpoint(["x.py", "ckpt=a.ckpt", "seed=1", "++ckpt=b.ckpt"], "one at a time") == Path("b.ckpt")
 
 
 @pytest.mark.parametrize("arguments", [["ckpt=a.ckpt,b.ckpt"], ["ckpt=a.ckpt", "hydra/launcher=submitit_slurm"]])
-def test_an_experiment_may_choose_the_data_where_checkpoints_cannot(tmp_path, arguments):
+def test_experiment_chooses_data_where_checkpoint_cannot(tmp_path, arguments):
     command = ["evaluate.py", *arguments, "experiment=paper/kitti_sim", "-m"]
     add_data(command, tmp_path / "o")
     assert command == ["evaluate.py", *arguments, "experiment=paper/kitti_sim", "-m"]
 
 
 @pytest.mark.parametrize("program", ["train", "evaluate"])
-def test_nodes_that_do_not_see_the_settings_are_not_sent_for_them(checkpoint, tmp_path, program):
+def test_slurm_launcher_is_refused(checkpoint, tmp_path, program):
     with pytest.raises(UserError, match=r"submitit_slurm: its nodes do not see(.|\n)*change: submit a job"):
         composed(tmp_path / "o", checkpoint, "hydra/launcher=submitit_slurm", program=program)
 
@@ -202,24 +201,24 @@ def test_nodes_that_do_not_see_the_settings_are_not_sent_for_them(checkpoint, tm
         ("trainer.max_epochs=2", r"2 of 2 epochs\n  change: trainer\.max_epochs=4"),
     ],
 )
-def test_what_cannot_change_says_so(checkpoint, tmp_path, override, words):
+def test_resuming_refuses_other_parts_and_finished_training(checkpoint, tmp_path, override, words):
     config = composed(tmp_path / "o", checkpoint, override)
     module = train.build_module(config, instantiate(config.datamodule), "folder")
     with pytest.raises(UserError, match=words):
         require_resumable(checkpoint, module, Trainer(accelerator="cpu", max_epochs=config.trainer.max_epochs))
 
 
-def test_a_finished_training_is_prolonged_by_nothing_but_more_epochs(checkpoint, scans, tmp_path):
+def test_longer_training_repeats_the_batches_of_an_unbroken_run(checkpoint, scans, tmp_path):
     run(tmp_path / "unbroken", scans, *RUN[:-1], "trainer.max_epochs=4")
     again = run(tmp_path / "again", scans, f"ckpt={checkpoint}", "trainer.max_epochs=4")
     whole, rest = curves(tmp_path / "unbroken"), curves(tmp_path / "again")
     assert rest["train/loss_step"] == whole["train/loss_step"][4:]  # the very same batches
-    told = torch.load(again, weights_only=True)["hyper_parameters"]["trained_on"]
-    assert told["data_name"] == "folder" and "root" not in told["data"]
+    trained_on = torch.load(again, weights_only=True)["hyper_parameters"]["trained_on"]
+    assert trained_on["data_name"] == "folder" and "root" not in trained_on["data"]
 
 
 @pytest.mark.slow
-def test_a_training_that_was_stopped_within_an_epoch_says_what_is_left_out(scans, tmp_path, capsys):
+def test_resuming_warns_of_batches_skipped_within_an_epoch(scans, tmp_path, capsys):
     last = run(tmp_path / "run", scans, *RUN, "trainer.max_steps=1")
     out = capsys.readouterr().out
     assert "trainer.max_steps=1 is reached within an epoch" in out and "100 %" not in out
@@ -228,7 +227,7 @@ def test_a_training_that_was_stopped_within_an_epoch_says_what_is_left_out(scans
 
 
 @pytest.mark.slow
-def test_a_checkpoint_from_within_an_epoch_goes_on_there(scans, tmp_path, recwarn):
+def test_checkpoint_from_within_an_epoch_resumes_there(scans, tmp_path, recwarn):
     of_steps = [
         "+callbacks.steps._target_=lightning.pytorch.callbacks.ModelCheckpoint", "+callbacks.steps.filename=step",
         f"+callbacks.steps.dirpath={tmp_path}", "+callbacks.steps.every_n_train_steps=1", "trainer.max_steps=3",
@@ -243,7 +242,7 @@ def test_a_checkpoint_from_within_an_epoch_goes_on_there(scans, tmp_path, recwar
 
 
 @pytest.mark.slow
-def test_no_time_is_left(scans, tmp_path, capsys):
+def test_resuming_is_refused_without_time_left(scans, tmp_path, capsys):
     last = run(tmp_path / "run", scans, *RUN[:-2], "trainer.max_epochs=-1", "trainer.max_time=00:00:00:01")
     assert "trainer.max_time is reached" in capsys.readouterr().out
     with pytest.raises(SystemExit):
@@ -251,14 +250,14 @@ def test_no_time_is_left(scans, tmp_path, capsys):
     assert "all of trainer.max_time" in capsys.readouterr().err
 
 
-def test_data_of_a_checkpoint_lie_where_they_do_on_this_machine(checkpoint, tmp_path, monkeypatch):
+def test_data_root_is_that_of_this_machine(checkpoint, tmp_path, monkeypatch):
     content = torch.load(checkpoint, weights_only=True)
-    content["hyper_parameters"]["trained_on"]["data"]["root"] = "/home/alice/data"  # as they used to be written
+    content["hyper_parameters"]["trained_on"]["data"]["root"] = "/home/alice/data"  # older checkpoints store it
     torch.save(content, tmp_path / "old.ckpt")
     monkeypatch.setenv("LIDARLEARN_DATA", "/home/bob")
-    for name in (checkpoint, tmp_path / "old.ckpt"):
-        assert composed(tmp_path / "o", name, program="evaluate").data.root == "/home/bob/folder"
-    assert composed(tmp_path / "o", checkpoint, "data.root=/mine", program="evaluate").data.root == "/mine"
+    assert composed(tmp_path / "o", checkpoint, program="evaluate").data.root == "/home/bob/folder"
+    assert composed(tmp_path / "o", tmp_path / "old.ckpt").data.root == "/home/bob/folder"
+    assert composed(tmp_path / "o", checkpoint, "data.root=/mine").data.root == "/mine"
 
 
 RUN_FOLDER = "lidarlearn.commands.run_folder"
@@ -267,14 +266,14 @@ FOREIGN = {"_target_": f"{RUN_FOLDER}.git_revision"}
 
 @pytest.mark.parametrize("command", [train, evaluate])
 @pytest.mark.parametrize(
-    ("part", "evil", "said"),
+    ("part", "evil", "message"),
     [
         ("data", {"_target_": f"{RUN_FOLDER}._git", "_args_": ["-c", "alias.x=!touch PWNED", "x"]}, "_git"),
         ("data_name", "../../somewhere", "not a valid name of a data set"),
         ("data_name", "${oc.env:HOME}", "not a valid name of a data set"),
     ],
 )
-def test_a_checkpoint_from_elsewhere_runs_nothing(checkpoint, tmp_path, monkeypatch, capsys, command, part, evil, said):
+def test_untrusted_checkpoint_runs_no_code(checkpoint, tmp_path, monkeypatch, capsys, command, part, evil, message):
     content = torch.load(checkpoint, weights_only=True)
     content["hyper_parameters"]["trained_on"][part] = evil
     torch.save(content, tmp_path / "evil.ckpt")
@@ -283,7 +282,7 @@ def test_a_checkpoint_from_elsewhere_runs_nothing(checkpoint, tmp_path, monkeypa
     with pytest.raises(SystemExit):
         command.main()
     error = capsys.readouterr().err
-    assert said in error and "change: " in error
+    assert message in error and "change: " in error
     assert not list(tmp_path.rglob("PWNED"))
 
 
@@ -297,7 +296,7 @@ def test_a_checkpoint_from_elsewhere_runs_nothing(checkpoint, tmp_path, monkeypa
         (("module",), FOREIGN["_target_"]),
     ],
 )
-def test_parts_of_a_checkpoint_are_of_their_kind_and_its_settings_plain(checkpoint, tmp_path, keys, value):
+def test_untrusted_part_or_setting_is_refused(checkpoint, tmp_path, keys, value):
     content = torch.load(checkpoint, weights_only=True)
     *places, key = keys
     functools.reduce(operator.getitem, places, content)[key] = value
