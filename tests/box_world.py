@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data.sequence import DataSet, LayoutReport, Scan, Sequence
+from lidarlearn.data.layout import LayoutReport
+from lidarlearn.data.sequence import DataSet, Scan, Sequence
 from lidarlearn.geometry import se3
 from lidarlearn.geometry.projection import SphericalProjection
 

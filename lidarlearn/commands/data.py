@@ -17,7 +17,8 @@ from rich.text import Text
 from lidarlearn.commands.checkpoint_options import quoted
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.entry_point import readable_errors
-from lidarlearn.data.sequence import DataSet, LayoutReport
+from lidarlearn.data.layout import LayoutReport
+from lidarlearn.data.sequence import DataSet
 from lidarlearn.errors import UserError
 
 _STYLES = {"found": "green", "odd": "yellow", "missing": "bold red"}

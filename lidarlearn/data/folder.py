@@ -17,14 +17,14 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data import layout
 from lidarlearn.data.cloud_files import SUFFIXES, as_scan, note_returns, read_cloud, require_point_times
 from lidarlearn.data.errors import DamagedFileError
-from lidarlearn.data.ground_truth import describe_ground_truth, find_ground_truth, read_ground_truth
+from lidarlearn.data.ground_truth import find_ground_truth, read_ground_truth
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import read_times
 from lidarlearn.data.scan_files import ScanFiles, full_path, holds_scans, is_folder, list_scans, subfolders
-from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sequence import Names, Scan, Sequence
 from lidarlearn.data.sweep_stamps import sweep_clock
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
@@ -166,12 +166,12 @@ class Folder(DataSetOnDisk):
             return
         scans = list_scans(folder, SUFFIXES)
         kinds = _kinds(scans)
-        layout.describe_scans(report, name, scans, 4 * self.bin_columns if kinds == [".bin"] else None)
+        report.describe_scans(name, scans, 4 * self.bin_columns if kinds == [".bin"] else None)
         if len(kinds) > 1:
             report.missing(name, f"scans of several kinds: {', '.join(kinds)}")
         if (folder / "times.txt").is_file():
-            layout.describe_rows(report, name, folder / "times.txt", "times", len(scans))
-        describe_ground_truth(report, name, find_ground_truth(folder))
+            report.describe_rows(name, folder / "times.txt", "times", len(scans))
+        report.describe_ground_truth(name, find_ground_truth(folder))
 
     def _remark_on_others(self) -> str | None:
         """A remark on scans beside folders of scans, if all of the folders are configured and the scans are not."""

@@ -14,7 +14,7 @@ which for turned points reads [2.4, -0.01, -2.3, 180, 0, 0].
 import logging
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import start_at_identity, transforms_from_euler
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders, warn_of_gaps
-from lidarlearn.data.sequence import LayoutReport, Names, Scan
+from lidarlearn.data.sequence import Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.progress import tracked
 
@@ -112,20 +112,19 @@ class FordCampus(DataSetOnDisk):
 
     def sequence(self, name: str) -> FordCampusSequence:
         """Open a drive; the first time reads every scan for its pose."""
-        scans = self._scans(name).first(self.max_frames)
-        return self._open(name, scans, read_poses)
+        return self._open(name, self.max_frames)
 
     def open_for_check(self, name: str) -> FordCampusSequence:
         """Open the first scan of a drive: reading all for their poses takes minutes."""
-        return self._open(name, self._scans(name).first(1), lambda _, scans: _read_pose(scans.path(0))[None])
+        return self._open(name, 1)
 
-    def _open(
-        self, name: str, scans: ScanFiles, read: Callable[[str, ScanFiles], NDArray[np.float64]]
-    ) -> FordCampusSequence:
+    def _open(self, name: str, count: int | None) -> FordCampusSequence:
+        """Open the first `count` scans of a drive; None opens all."""
         self.refuse_deskew()
+        scans = self._scans(name).first(count)
         self.require_scans(name, scans, "Scan*.mat")
         warn_of_gaps(name, scans)
-        stamped = read(name, scans)
+        stamped = read_poses(name, scans)
         T_world_vehicle = transforms_from_euler(stamped[:, 1:4], stamped[:, 4:])
         return FordCampusSequence(
             name=name,
@@ -135,9 +134,6 @@ class FordCampus(DataSetOnDisk):
             min_range_m=self.min_range_m,
             beam_correction_deg=self.beam_correction_deg,
         )
-
-    def _scans(self, name: str) -> ScanFiles:
-        return list_scans(self.root / name / "SCANS", (".mat",), r"Scan\d+", "Scan0001.mat")
 
     @staticmethod
     def is_root(path: Path) -> bool:
@@ -154,7 +150,10 @@ class FordCampus(DataSetOnDisk):
             report.missing(name, f"no folder {name}")
             return
         scans = self._scans(name)
-        layout.describe_scans(report, name, scans, bytes_per_point=None, smallest_bytes=_SMALLEST_BYTES)
+        report.describe_scans(name, scans, bytes_per_point=None, smallest_bytes=_SMALLEST_BYTES)
+
+    def _scans(self, name: str) -> ScanFiles:
+        return list_scans(self.root / name / "SCANS", (".mat",), r"Scan\d+", "Scan0001.mat")
 
 
 def read_scan(path: Path) -> np.void:
@@ -172,9 +171,13 @@ def read_scan(path: Path) -> np.void:
 def read_poses(name: str, scans: ScanFiles) -> NDArray[np.float64]:
     """Time [us], position [m], roll, pitch and heading [rad] of every scan (n, 7), kept in a file beside the scans.
 
+    Those of a single scan are not kept: they would replace those of the whole drive.
+
     Raises:
         DamagedFileError: a scan cannot be read or its pose is not finite.
     """
+    if len(scans) == 1:
+        return _read_pose(scans.path(0))[None]
     kept = scans.folder.parent / _POSES_FILE
     key = scans.fingerprint("poses")
     if (stamped := _kept_poses(kept, key)) is not None:

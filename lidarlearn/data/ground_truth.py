@@ -8,12 +8,11 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data import layout
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.pose_files import read_kitti_poses, read_lines, read_tum_poses, start_at_identity
 from lidarlearn.data.scan_files import full_path
-from lidarlearn.data.sequence import LayoutReport
 
 _INSIDE = ("poses.txt", "poses.tum", "groundtruth.txt")
 _BESIDE = (".txt", ".tum")
@@ -107,14 +106,6 @@ def read_ground_truth(path: Path) -> GroundTruth:
         return GroundTruth(path, read_kitti_poses(path), None)
     stamped = read_tum_poses(path)
     return GroundTruth(path, stamped.T_world_body, stamped.timestamps)
-
-
-def describe_ground_truth(report: LayoutReport, name: str, path: Path | None) -> None:
-    """Note the file of a recording's ground truth, or that there is none."""
-    if path is None:
-        report.odd(name, "no ground truth: errors will not be defined, and the supervised loss cannot be used")
-    else:
-        report.found(name, f"ground truth in {path} with {layout.count_rows(path)} rows")
 
 
 def describe_coverage(

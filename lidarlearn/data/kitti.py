@@ -12,9 +12,9 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import read_kitti_poses, read_labelled_transform, read_times, start_at_identity
 from lidarlearn.data.scan_files import (
@@ -25,7 +25,7 @@ from lidarlearn.data.scan_files import (
     subfolders,
     warn_of_gaps,
 )
-from lidarlearn.data.sequence import LayoutReport, Scan
+from lidarlearn.data.sequence import Scan
 
 _WITH_GROUND_TRUTH = tuple(f"{i:02d}" for i in range(11))
 
@@ -106,14 +106,14 @@ class KittiOdometry(DataSetOnDisk):
             report.missing(name, f"no folder sequences/{name}")
             return
         scans = self._scans(name)
-        layout.describe_scans(report, name, scans, bytes_per_point=16)
+        report.describe_scans(name, scans, bytes_per_point=16)
         if not (folder / "calib.txt").is_file():
             report.missing(name, "no calib.txt")
         rows_needed = max(scans.numbers, default=-1) + 1
-        layout.describe_rows(report, name, folder / "times.txt", "times", rows_needed)
+        report.describe_rows(name, folder / "times.txt", "times", rows_needed)
         if name in _WITH_GROUND_TRUTH:
             poses = self.root / "poses" / f"{name}.txt"
-            layout.describe_rows(report, name, poses, "poses", rows_needed, needed=name in self.test_sequences)
+            report.describe_rows(name, poses, "poses", rows_needed, needed=name in self.test_sequences)
 
     def _scans(self, name: str) -> ScanFiles:
         return list_scans(self.root / "sequences" / name / "velodyne", (".bin",), r"\d{6}", "000000.bin")

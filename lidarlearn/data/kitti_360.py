@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data import layout
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered
 from lidarlearn.data.kitti_raw import KittiRawSequence
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.oxts import read_timestamps
 from lidarlearn.data.pose_files import (
@@ -29,7 +29,6 @@ from lidarlearn.data.pose_files import (
     require_finite,
 )
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders
-from lidarlearn.data.sequence import LayoutReport
 
 _PREFIX, _SUFFIX = "2013_05_28_drive_", "_sync"
 
@@ -103,16 +102,11 @@ class Kitti360(DataSetOnDisk):
             report.missing(name, f"no folder {folder.relative_to(self.root)}")
             return
         scans = self._scans(name)
-        layout.describe_scans(report, name, scans, bytes_per_point=16)
+        report.describe_scans(name, scans, bytes_per_point=16)
         rows_needed = max(scans.numbers, default=-1) + 1
         stamps = folder / "velodyne_points" / "timestamps.txt"
-        layout.describe_rows(report, name, stamps, "times", rows_needed, needed=True)
-        poses = self._poses_file(name)
-        if poses.is_file():
-            report.found(name, f"{layout.count_rows(poses)} poses")
-        else:
-            note = report.missing if name in self.test_sequences else report.odd
-            note(name, f"no ground truth: no {poses.relative_to(self.root)}")
+        report.describe_rows(name, stamps, "times", rows_needed, needed=True)
+        report.describe_ground_truth(name, self._poses_file(name), needed=name in self.test_sequences)
 
     def _scans(self, name: str) -> ScanFiles:
         folder = self.root / "data_3d_raw" / drive_folder(name) / "velodyne_points" / "data"

@@ -18,10 +18,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered, interpolate_poses
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.oxts import read_oxts_poses, read_rigid_transform, read_timestamps
 from lidarlearn.data.pose_files import start_at_identity
@@ -33,7 +33,7 @@ from lidarlearn.data.scan_files import (
     subfolders,
     warn_of_gaps,
 )
-from lidarlearn.data.sequence import LayoutReport, Scan
+from lidarlearn.data.sequence import Scan
 
 
 @dataclass(frozen=True)
@@ -155,20 +155,20 @@ class KittiRaw(DataSetOnDisk):
             report.missing(name, f"no folder {folder.relative_to(self.root)}")
             return
         scans = self._scans(name)
-        layout.describe_scans(report, name, scans, bytes_per_point=16)
+        report.describe_scans(name, scans, bytes_per_point=16)
         rows_needed = max(scans.numbers, default=-1) + 1
         for end in ("start", "end"):
             stamps = folder / "velodyne_points" / f"timestamps_{end}.txt"
-            layout.describe_rows(report, name, stamps, f"{end} times", rows_needed, needed=True)
+            report.describe_rows(name, stamps, f"{end} times", rows_needed, needed=True)
         packets = _packets(folder).numbers
         if not packets:
-            note = report.missing if name in self.test_sequences else report.odd
-            note(name, f"no ground truth: no files in {folder / 'oxts' / 'data'}")
+            detail = f"no ground truth: no files in {folder / 'oxts' / 'data'}"
+            report.absent(name, detail, needed=name in self.test_sequences)
             return
         if len(packets) < rows_needed:
             report.odd(name, f"{len(packets)} GPS/IMU packets for scans numbered up to {rows_needed - 1}")
         stamps = folder / "oxts" / "timestamps.txt"
-        layout.describe_rows(report, name, stamps, "GPS/IMU times", max(packets) + 1, needed=True)
+        report.describe_rows(name, stamps, "GPS/IMU times", max(packets) + 1, needed=True)
         if not (folder.parent / "calib_imu_to_velo.txt").is_file():
             report.missing(name, f"no calibration {folder.parent.name}/calib_imu_to_velo.txt")
 

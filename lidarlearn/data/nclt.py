@@ -18,14 +18,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.errors import DamagedFileError
 from lidarlearn.data.interpolation import covered
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import StampedPoses, read_numbers, transforms_from_euler
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, read_bytes, subfolders
-from lidarlearn.data.sequence import LayoutReport, Names, Scan
+from lidarlearn.data.sequence import Names, Scan
 from lidarlearn.geometry.projection import SphericalProjection
 
 POINT = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
@@ -102,9 +102,9 @@ class Nclt(DataSetOnDisk):
         self.refuse_deskew()
         scans = self._scans(name)
         self.require_scans(name, scans, "*.bin")
-        truth, truth_file = None, self._truth_file(name)
-        if truth_file is not None:
-            truth = read_ground_truth(truth_file)
+        truth_file = self._truth_file(name)
+        truth = read_ground_truth(truth_file) if truth_file.is_file() else None
+        if truth is not None:
             scans = scans.select(covered(truth_file, name, _timestamps(scans), truth.timestamps))
         scans = scans.first(self.max_frames)
         timestamps = _timestamps(scans)
@@ -132,22 +132,15 @@ class Nclt(DataSetOnDisk):
             report.missing(name, f"no folder {name}")
             return
         scans = self._scans(name)
-        layout.describe_scans(report, name, scans, POINT.itemsize)
-        note = report.missing if name in self.test_sequences else report.odd
-        truth_file = self._truth_file(name)
-        if truth_file is None:
-            note(name, f"no ground truth: no groundtruth_{name}.csv in {name} or ground_truth")
-        elif truth_file.stat().st_size == 0:
-            report.missing(name, f"empty ground truth: {truth_file}")
-        else:
-            report.found(name, f"ground truth in {truth_file.relative_to(self.root)}")
+        report.describe_scans(name, scans, POINT.itemsize)
+        report.describe_ground_truth(name, self._truth_file(name), needed=name in self.test_sequences)
 
     def _scans(self, name: str) -> ScanFiles:
         return list_scans(self.root / name / "velodyne_sync", (".bin",), r"\d+", "1326030975726043.bin")
 
-    def _truth_file(self, name: str) -> Path | None:
-        candidates = (folder / f"groundtruth_{name}.csv" for folder in (self.root / name, self.root / "ground_truth"))
-        return next((path for path in candidates if path.is_file()), None)
+    def _truth_file(self, name: str) -> Path:
+        inside, beside = (self.root / folder / f"groundtruth_{name}.csv" for folder in (name, "ground_truth"))
+        return beside if beside.is_file() and not inside.is_file() else inside
 
 
 def read_ground_truth(path: Path) -> StampedPoses:

@@ -15,14 +15,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from lidarlearn.data import layout
 from lidarlearn.data.beam_correction import raise_beams
 from lidarlearn.data.cloud_files import note_returns, read_cloud
 from lidarlearn.data.interpolation import covered
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.on_disk import DataSetOnDisk, SequenceOnDisk
 from lidarlearn.data.pose_files import StampedPoses, read_numbers, stamped_poses
 from lidarlearn.data.scan_files import ScanFiles, is_folder, list_scans, subfolders
-from lidarlearn.data.sequence import LayoutReport, Scan
+from lidarlearn.data.sequence import Scan
 from lidarlearn.geometry import se3
 
 BEAMS, COLUMNS = 64, 1024
@@ -109,15 +109,8 @@ class NewerCollege(DataSetOnDisk):
             report.missing(name, f"no folder {name}")
             return
         scans = _scans(self.root / name)
-        layout.describe_scans(report, name, scans, bytes_per_point=None)
-        note = report.missing if name in self.test_sequences else report.odd
-        truth = self._truth_file(name)
-        if not truth.is_file():
-            note(name, f"no ground truth: no {truth.relative_to(self.root)}")
-        elif truth.stat().st_size == 0:
-            report.missing(name, f"empty ground truth: {truth}")
-        else:
-            report.found(name, f"ground truth in {truth.relative_to(self.root)}")
+        report.describe_scans(name, scans, bytes_per_point=None)
+        report.describe_ground_truth(name, self._truth_file(name), needed=name in self.test_sequences)
 
     def _truth_file(self, name: str) -> Path:
         return self.root / name / "ground_truth" / "registered_poses.csv"

@@ -9,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarlearn.data.errors import ROOT_REMEDY, DataSetNotFoundError
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.scan_files import ScanFiles, examples, full_path, is_folder, subfolders
-from lidarlearn.data.sequence import DataSet, LayoutReport, Sequence
+from lidarlearn.data.sequence import DataSet, Sequence
 from lidarlearn.errors import UserError
 
 _NO_SETTINGS = ("name", "scans", "T_world_lidar", "timestamps")

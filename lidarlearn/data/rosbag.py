@@ -23,14 +23,14 @@ from lidarlearn.data.errors import DamagedFileError, one_line
 from lidarlearn.data.ground_truth import (
     GroundTruth,
     describe_coverage,
-    describe_ground_truth,
     find_ground_truth,
     read_ground_truth,
 )
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.on_disk import DataSetOnDisk
 from lidarlearn.data.point_cloud2 import fields_of
 from lidarlearn.data.scan_files import ScanFiles
-from lidarlearn.data.sequence import LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sequence import Names, Scan, Sequence
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 
@@ -187,7 +187,7 @@ class Rosbag(DataSetOnDisk):
                 report.odd(name, doubt)
             clouds = bag.cloud_topic(self.topic)
             path = find_ground_truth(bag.path, name)
-            describe_ground_truth(report, name, path)
+            report.describe_ground_truth(name, path)
             if path is not None:
                 describe_coverage(report, name, read_ground_truth(path), clouds.count, *ends_s(bag, clouds))
         except UserError as problem:

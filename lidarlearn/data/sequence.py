@@ -4,9 +4,8 @@ import logging
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -15,13 +14,13 @@ from torch import Tensor
 from lidarlearn.data.contract import require_points, require_poses, require_timestamps
 from lidarlearn.data.errors import one_line, require_count
 from lidarlearn.data.field_of_view import field_of_view_warning
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.scan_files import sequence_names
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection
 
 _log = logging.getLogger(__name__)
 
-Level = Literal["found", "odd", "missing"]
 Names = Iterable[str | int] | str | int
 
 
@@ -109,43 +108,6 @@ class Sequence(ABC):
 
     def __iter__(self) -> Iterator[Scan]:
         return (self.scan(i) for i in range(len(self)))
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of a layout check: how bad it is, what was checked, and what was found."""
-
-    level: Level
-    what: str
-    detail: str
-
-
-@dataclass
-class LayoutReport:
-    """What a copy of a data set holds, what it lacks and what looks odd.
-
-    Args:
-        usable: whether the data can be used as configured.
-        findings: in the order in which they were made.
-        remedy: what to change if it is not usable; "" if the findings say enough.
-    """
-
-    usable: bool = True
-    findings: list[Finding] = field(default_factory=list)
-    remedy: str = ""
-
-    def found(self, what: str, detail: str) -> None:
-        """Add something that is as it should be."""
-        self.findings.append(Finding("found", what, detail))
-
-    def odd(self, what: str, detail: str) -> None:
-        """Add something unexpected that does not prevent use."""
-        self.findings.append(Finding("odd", what, detail))
-
-    def missing(self, what: str, detail: str) -> None:
-        """Add something without which the data cannot be used as configured."""
-        self.findings.append(Finding("missing", what, detail))
-        self.usable = False
 
 
 class DataSet(ABC):

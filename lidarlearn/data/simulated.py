@@ -10,9 +10,10 @@ import numpy as np
 import torch
 
 from lidarlearn.data.errors import DamagedFileError, DataSetNotFoundError, one_line, require_count
+from lidarlearn.data.layout import LayoutReport
 from lidarlearn.data.locked import locked
 from lidarlearn.data.range_images import image_path, make_images, missing_images
-from lidarlearn.data.sequence import DataSet, LayoutReport, Names, Scan, Sequence
+from lidarlearn.data.sequence import DataSet, Names, Scan, Sequence
 from lidarlearn.data.writable import writable
 from lidarlearn.errors import UserError
 from lidarlearn.geometry.projection import SphericalProjection

@@ -7,7 +7,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from lidarlearn.commands.configs import config_directory
-from lidarlearn.data.sequence import DataSet, LayoutReport
+from lidarlearn.data.layout import LayoutReport
+from lidarlearn.data.sequence import DataSet
 
 SPLITS = ("train_sequences", "val_sequences", "test_sequences")
 
