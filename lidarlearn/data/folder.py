@@ -185,7 +185,7 @@ class Folder(DataSetOnDisk):
 
     def _shares_per_unit(self, files: ScanFiles, timestamps: Float[Tensor, "n"] | None) -> float | None:
         """Scan periods per unit of the points' times, from the file in the middle of the recording."""
-        if timestamps is None or len(files) < 2 or _kinds(files) not in ([".npy"], [".pcd"], [".ply"]):
+        if timestamps is None or len(files) < 2 or _kinds(files) == [".bin"]:
             return None
         period_s = float(timestamps.diff().median())
         try:

@@ -80,7 +80,7 @@ class DataSetOnDisk(DataSet):
         self._check_root(report)
         if not report.usable:
             return report
-        found = self._whole()
+        found = self._with_scans()
         for name in self.names:
             self.check_sequence(report, name)
         for name in found:
@@ -103,7 +103,7 @@ class DataSetOnDisk(DataSet):
             missing: what was not found.
         """
         near = None if self.is_root(self.root) else self._root_nearby()
-        found = self._whole()
+        found = self._with_scans()
         if near is not None:
             remedy = f"wrong folder level, data.root={near} looks right"
         elif found and name not in found:
@@ -159,6 +159,6 @@ class DataSetOnDisk(DataSet):
         nearby = itertools.chain(below, grandchildren, list(full_path(self.root).parents)[:2])
         return next((path for path in nearby if self.is_root(path)), None)
 
-    def _whole(self) -> dict[str, ScanFiles]:
+    def _with_scans(self) -> dict[str, ScanFiles]:
         """The existing sequences with at least one scan."""
         return {name: scans for name, scans in self.found().items() if len(scans)}

@@ -63,7 +63,7 @@ class RosbagSequence(Sequence):
     shares_per_unit: float | None
     max_intensity: float | None
     beam_correction_deg: float
-    empty: list[int] = field(default_factory=list)
+    empty: list[int] = field(default_factory=list, init=False)
 
     def __len__(self) -> int:
         return len(self.places)
