@@ -17,45 +17,51 @@ from tests.gpu import on_gpu
 from tests.training.runs import configured
 
 
-def make(tmp_path, drives=None, **settings):
+@pytest.fixture(scope="module")
+def cache_root(tmp_path_factory):
+    """Vertex maps are projected once for all tests."""
+    return tmp_path_factory.mktemp("vertex_maps")
+
+
+def make(cache_root, drives=None, **settings):
     settings = {"batch_size": 4, "num_workers": 0, "preparation_workers": 0} | settings
-    module = OdometryDataModule(drives or BoxDrives(frames=9), cache_root=str(tmp_path), **settings)
+    module = OdometryDataModule(drives or BoxDrives(frames=9), cache_root=str(cache_root), **settings)
     module.prepare_data()
     module.setup()
     module.keep_maps_on(torch.device("cpu"))
     return module
 
 
-def test_epoch_has_each_training_pair_once(tmp_path):
-    module = make(tmp_path)
+def test_epoch_has_each_training_pair_once(cache_root):
+    module = make(cache_root)
     batches = list(module.train_dataloader())
     assert [len(b["index"]) for b in batches] == [4, 4, 4, 4]
     assert sorted(torch.cat([b["index"] for b in batches]).tolist()) == sorted([*range(8), *range(8)])
 
 
-def test_small_share_of_process_keeps_incomplete_batch(tmp_path):
-    module = make(tmp_path, BoxDrives(frames=7, train_sequences=("0",)))
+def test_small_share_of_process_keeps_incomplete_batch(cache_root):
+    module = make(cache_root, BoxDrives(frames=7, train_sequences=("0",)))
     assert len(module.train_dataloader()) == 1  # a batch of four; the other two pairs are dropped
     module.trainer = SimpleNamespace(world_size=2)
     assert not module.train_dataloader().drop_last  # three pairs each
 
 
-def test_training_pairs_are_shuffled(tmp_path):
-    module = make(tmp_path)
+def test_training_pairs_are_shuffled(cache_root):
+    module = make(cache_root)
     torch.manual_seed(0)
     epochs = [torch.cat([b["index"] for b in module.train_dataloader()]).tolist() for _ in range(2)]
     assert epochs[0] != epochs[1]
 
 
-def test_each_validation_sequence_has_ordered_loader(tmp_path):
-    module = make(tmp_path, BoxDrives(frames=9, val_sequences=("2", "4")))
+def test_each_validation_sequence_has_ordered_loader(cache_root):
+    module = make(cache_root, BoxDrives(frames=9, val_sequences=("2", "4")))
     assert [s.name for s in module.val_sequences] == ["2", "4"]
     for loader in module.val_dataloader():
         assert torch.cat([b["index"] for b in loader]).tolist() == list(range(8))
 
 
-def test_batches_are_decoded_to_metres_after_transfer(tmp_path):
-    module = make(tmp_path)
+def test_batches_are_decoded_to_metres_after_transfer(cache_root):
+    module = make(cache_root)
     raw = next(iter(module.val_dataloader()[0]))
     batch = module.on_after_batch_transfer(raw, 0)
     assert raw["reference"].dtype == torch.int16 and batch["reference"].dtype == torch.float32
@@ -68,15 +74,15 @@ def test_batches_are_decoded_to_metres_after_transfer(tmp_path):
 @pytest.mark.parametrize(
     ("height", "width", "expected"), [(None, None, (16, 96)), (8, None, (8, 96)), (8, 48, (8, 48))]
 )
-def test_image_size_may_differ_from_data_set(tmp_path, height, width, expected):
-    module = make(tmp_path, height=height, width=width)
+def test_image_size_may_differ_from_data_set(cache_root, height, width, expected):
+    module = make(cache_root, height=height, width=width)
     assert (module.projection.height, module.projection.width) == expected
     assert module.projection.fov_up_deg == SMALL.fov_up_deg
     assert next(iter(module.train_dataloader()))["reference"].shape == (4, 3, *expected)
 
 
-def test_one_sequence_without_poses_removes_labels(tmp_path):
-    module = make(tmp_path, BoxDrives(frames=9, without_truth=("1",)))
+def test_one_sequence_without_poses_removes_labels(cache_root):
+    module = make(cache_root, BoxDrives(frames=9, without_truth=("1",)))
     assert all("T_ref_new" not in batch for batch in module.train_dataloader())
     assert "T_ref_new" in next(iter(module.val_dataloader()[0]))
 
@@ -85,8 +91,8 @@ ALL_CHANGES = Augmentation(mirror=True, turn=True, reverse=True, max_skip=3, dro
 
 
 @pytest.mark.parametrize("augmentation", [None, ALL_CHANGES])
-def test_resident_maps_give_equal_batches(tmp_path, augmentation):
-    modules = [make(tmp_path, resident=resident, augmentation=augmentation) for resident in (False, True)]
+def test_resident_maps_give_equal_batches(cache_root, augmentation):
+    modules = [make(cache_root, resident=resident, augmentation=augmentation) for resident in (False, True)]
     trained, validated = [], []
     for module in modules:
         torch.manual_seed(0)
@@ -101,8 +107,8 @@ def test_resident_maps_give_equal_batches(tmp_path, augmentation):
     assert next(iter(modules[1].train_dataloader()))["reference"].shape == (4, 3, 16, 96)
 
 
-def test_augmentation_applies_in_training_only(tmp_path):
-    plain, augmented = make(tmp_path), make(tmp_path, augmentation=ALL_CHANGES)
+def test_augmentation_applies_in_training_only(cache_root):
+    plain, augmented = make(cache_root), make(cache_root, augmentation=ALL_CHANGES)
     for is_training in (False, True):
         augmented.trainer = SimpleNamespace(training=is_training)
         for batches in zip(plain.val_dataloader()[0], augmented.val_dataloader()[0], strict=True):
@@ -111,14 +117,14 @@ def test_augmentation_applies_in_training_only(tmp_path):
 
 
 @pytest.mark.parametrize(("resident", "is_kept"), [("auto", False), (True, True), (False, False)])
-def test_maps_are_resident_on_cpu_only_if_requested(tmp_path, resident, is_kept):
-    rows = next(iter(make(tmp_path, resident=resident).val_dataloader()[0]))["reference"]
+def test_maps_are_resident_on_cpu_only_if_requested(cache_root, resident, is_kept):
+    rows = next(iter(make(cache_root, resident=resident).val_dataloader()[0]))["reference"]
     assert (rows.dim() == 1) == is_kept
 
 
 @pytest.mark.parametrize(("free", "is_kept"), [(3.0, True), (1.5, False)])
-def test_maps_are_resident_if_below_half_of_free_memory(tmp_path, monkeypatch, free, is_kept):
-    module = make(tmp_path)
+def test_maps_are_resident_if_below_half_of_free_memory(cache_root, monkeypatch, free, is_kept):
+    module = make(cache_root)
     monkeypatch.setattr("lidarlearn.data.datamodule._free_memory", lambda _: int(free * module._maps.nbytes))
     module.keep_maps_on(torch.device("cpu"))
     assert (next(iter(module.val_dataloader()[0]))["reference"].dim() == 1) == is_kept
@@ -133,36 +139,36 @@ def test_full_disk_is_refused_before_projection(tmp_path, monkeypatch):
     assert not list(tmp_path.rglob("vertex_maps.npy"))
 
 
-def test_out_of_memory_error_names_setting(tmp_path, monkeypatch):
+def test_out_of_memory_error_names_setting(cache_root, monkeypatch):
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    module = make(tmp_path)
+    module = make(cache_root)
     module.resident = True
     monkeypatch.setattr("lidarlearn.data.cache.VertexMaps.to", full)
     with pytest.raises(UserError, match=r"do not fit into the memory of cpu(.|\n)*datamodule\.resident=false"):
         module.keep_maps_on(torch.device("cpu"))
 
 
-def test_invalid_resident_setting_is_refused(tmp_path):
+def test_invalid_resident_setting_is_refused(cache_root):
     with pytest.raises(ValueError, match="true, false or auto, got 'always'"):
-        make(tmp_path, resident="always")
+        make(cache_root, resident="always")
 
 
 @pytest.mark.filterwarnings(
     "ignore:This process:DeprecationWarning"
 )  # fork beside torch's threads, from Python 3.12 on
-def test_workers_load_equal_batches(tmp_path):
-    plain, loaded = make(tmp_path), make(tmp_path, num_workers=2)
+def test_workers_load_equal_batches(cache_root):
+    plain, loaded = make(cache_root), make(cache_root, num_workers=2)
     for a, b in zip(plain.val_dataloader()[0], loaded.val_dataloader()[0], strict=True):
         torch.testing.assert_close(a["reference"], b["reference"])
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("num_workers", [0, 2])
-def test_validation_leaves_random_state_unchanged(tmp_path, num_workers):
+def test_validation_leaves_random_state_unchanged(cache_root, num_workers):
     """Otherwise the batches of the next epoch would depend on how often workers were started."""
-    module = make(tmp_path, num_workers=num_workers)
+    module = make(cache_root, num_workers=num_workers)
     state = torch.get_rng_state()
     list(module.val_dataloader()[0])
     assert torch.equal(state, torch.get_rng_state())
@@ -190,16 +196,16 @@ def test_missing_labels_are_reported_before_projection(tmp_path):
     assert not list((tmp_path / "cache").rglob("*.npy"))
 
 
-def test_empty_training_split_error_names_setting(tmp_path):
+def test_empty_training_split_error_names_setting(cache_root):
     with pytest.raises(UserError, match=r"data\.train_sequences"):
-        make(tmp_path, BoxDrives(frames=9, train_sequences=()))
+        make(cache_root, BoxDrives(frames=9, train_sequences=()))
 
 
 @on_gpu
-def test_maps_on_gpu_give_equal_batches(tmp_path):
+def test_maps_on_gpu_give_equal_batches(cache_root):
     batches = []
     for device in ("cpu", "cuda"):
-        module = make(tmp_path)
+        module = make(cache_root)
         module.keep_maps_on(torch.device(device))
         torch.manual_seed(0)
         batch = next(iter(module.train_dataloader()))
