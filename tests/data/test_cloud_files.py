@@ -39,7 +39,7 @@ def test_bin_and_npy_round_trip(tmp_path, columns):
         assert cloud.times is None
 
 
-@pytest.mark.parametrize("shape", [(200,), (4, 50)])
+@pytest.mark.parametrize("shape", [(200,), (4, 50)], ids=["flat", "organised"])
 def test_npy_with_named_fields(tmp_path, shape):
     points = random_points(0)
     points[3] = np.nan
@@ -74,14 +74,22 @@ def truncate_whole_points(path):
     path.write_bytes(path.read_bytes()[: -5 * (20 if path.suffix == ".pcd" else 24)])
 
 
+def empty(path):
+    path.write_bytes(b"")
+
+
+def replace_by_text(path):
+    path.write_text("x\n")
+
+
 @pytest.mark.parametrize("suffix", [".pcd", ".ply"])
 @pytest.mark.parametrize(
     ("damage", "problem"),
     [
         (truncate, "truncated"),
         (truncate_whole_points, "truncated"),
-        (lambda p: p.write_bytes(b""), "the file is empty"),
-        (lambda p: p.write_bytes(b"x\n"), "no .p(cd|ly) file"),
+        (empty, "the file is empty"),
+        (replace_by_text, "no .p(cd|ly) file"),
     ],
 )
 def test_damaged_pcd_or_ply_error_names_file(tmp_path, suffix, damage, problem):
@@ -175,6 +183,7 @@ def test_ascii_file_with_too_few_points_is_truncated(tmp_path):
         np.array(["a"] * 4),
         np.zeros(4, [("u", "f4")]),
     ],
+    ids=["no rows", "nan", "two columns", "one axis", "strings", "other fields"],
 )
 def test_npy_without_points_is_refused(tmp_path, rows):
     np.save(tmp_path / "scan.npy", rows)

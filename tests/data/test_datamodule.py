@@ -72,7 +72,7 @@ def test_batches_are_decoded_to_metres_after_transfer(cache_root):
 
 
 @pytest.mark.parametrize(
-    ("height", "width", "expected"), [(None, None, (16, 96)), (8, None, (8, 96)), (8, 48, (8, 48))]
+    ("height", "width", "expected"), [(None, None, (16, 96)), (8, None, (8, 96)), (8, 48, (8, 48))], ids=str
 )
 def test_image_size_may_differ_from_data_set(cache_root, height, width, expected):
     module = make(cache_root, height=height, width=width)
@@ -90,7 +90,7 @@ def test_one_sequence_without_poses_removes_labels(cache_root):
 ALL_CHANGES = Augmentation(mirror=True, turn=True, reverse=True, max_skip=3, drop_out=0.3)
 
 
-@pytest.mark.parametrize("augmentation", [None, ALL_CHANGES])
+@pytest.mark.parametrize("augmentation", [None, ALL_CHANGES], ids=["plain", "augmented"])
 def test_resident_maps_give_equal_batches(cache_root, augmentation):
     modules = [make(cache_root, resident=resident, augmentation=augmentation) for resident in (False, True)]
     trained, validated = [], []

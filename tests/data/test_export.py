@@ -111,6 +111,7 @@ class Recorded(Sequence):
     ("name", "sequence", "setting"),
     [("kitti_00-08", "03", {}), ("nclt", "2012-01-08", {}), ("folder", "drive", {"max_intensity": 200}),
      ("ford_campus", "IJRR-Dataset-1", {"T_vehicle_lidar_m_deg": [2.4, -0.01, -2.3, 180, 0, 10]})],
+    ids=["kitti", "nclt", "folder", "ford_campus"],
 )  # fmt: skip
 def test_export_preserves_intensities_and_extrinsics(name, sequence, setting, tmp_path):
     drive, target = Recorded(), data_set(name, tmp_path, **setting)
@@ -168,7 +169,9 @@ def test_export_refuses_format_without_point_times(suffix, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("chosen", [(), ("projection@to.projection=vlp16",), ("to.projection.fov_up_deg=20.5",)])
+@pytest.mark.parametrize(
+    "chosen", [(), ("projection@to.projection=vlp16",), ("to.projection.fov_up_deg=20.5",)], ids=str
+)
 def test_printed_command_selects_projection_of_sensor(chosen, tmp_path, capsys):
     write_folder(tmp_path / "scans")
     source = ("data=folder", f"data.root={tmp_path}/scans", "projection@data.projection=hdl32_inverted")
@@ -291,6 +294,7 @@ def test_matched_names_keep_splits_disjoint():
         (("to=kitti_00-08", "to.root=x", "suffix=.ply"), "to=folder"),
         (("to=folder", "to.root=x", "suffix=.las"), "suffix=.bin|.npy|.pcd|.ply"),
     ],
+    ids=["target", "suffix of other target", "suffix"],
 )
 def test_export_command_refuses_target_or_suffix(arguments, message, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -62,6 +62,7 @@ def test_sequences_warn_once(caplog):
         (["data=folder", "projection@data.projection=os1_64"], "ouster_mcd", "ouster_mcd"),
         (["data=folder", "projection@data.projection=hdl32"], "hdl32_pair", "hdl32_pair"),
     ],
+    ids=["kitti", "kitti_raw", "nclt", "kitti_pairs", "os1_64", "hdl32"],
 )
 def test_genuine_scans_fit_projections_of_their_sensors(real_data, data, root, sequence):
     data_set = compose_data_set([*data, f"data.root={real_data / root}"])

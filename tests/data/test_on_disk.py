@@ -18,7 +18,7 @@ class Cropped(SequenceOnDisk):
         return Scan(torch.zeros(1, 3))
 
 
-@pytest.mark.parametrize("setting", [{"box_m": (0.0, 9.0)}, {"beam_correction_deg": 0.2}])
+@pytest.mark.parametrize("setting", [{"box_m": (0.0, 9.0)}, {"beam_correction_deg": 0.2}], ids=str)
 def test_fingerprint_depends_on_settings_of_scans_only(setting, tmp_path):
     sequence = Cropped(
         name="drive", scans=ScanFiles(tmp_path, (), ()), T_world_lidar=None, timestamps=None, beam_correction_deg=0.0,

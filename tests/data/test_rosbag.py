@@ -52,6 +52,7 @@ def test_round_trip(tmp_path, kind, compression):
         ([("timestamp", "<f8"), *((axis, "<f8") for axis in "zyx")], 0),
         ([("X", "<f4"), ("Y", "<f4"), ("Z", "<f4"), ("", "u1"), ("offset_time", "<u4")], 13),
     ],
+    ids=["big endian", "float64 zyx", "padded rows"],
 )
 def test_clouds_in_layouts_of_other_drivers(tmp_path, kind, fields, row_padding):
     """Organised in 4 rows; three points without a return."""
@@ -164,7 +165,7 @@ def test_topic_must_be_chosen_among_several(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("topics", [{}, {"/points": []}, {"/chatter": ["hello"]}])
+@pytest.mark.parametrize("topics", [{}, {"/points": []}, {"/chatter": ["hello"]}], ids=str)
 def test_bag_without_point_clouds_is_refused(tmp_path, kind, topics):
     write_bag(tmp_path, "street", topics, kind)
     with pytest.raises(UserError, match="no PointCloud2 messages"):
@@ -199,7 +200,7 @@ def test_cloud_without_xyz_fields_is_refused(tmp_path):
     assert not rosbag(tmp_path).check().usable
 
 
-@pytest.mark.parametrize("empty", [(0, 1), (2, 3), (1, 2, 3, 4)])
+@pytest.mark.parametrize("empty", [(0, 1), (2, 3), (1, 2, 3, 4)], ids=str)
 def test_scans_without_returns_are_empty(tmp_path, caplog, empty):
     clouds = [as_rows(random_points(i) * (i not in empty), OUSTER, t=TIMES_NS) for i in range(5)]
     write_bag(tmp_path, "street", {"/points": clouds})

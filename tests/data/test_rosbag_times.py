@@ -156,7 +156,7 @@ def test_kitti_ground_truth_is_cut_to_max_frames(tmp_path):
         assert f"{there} poses for 3 messages" in findings(rosbag(tmp_path).check(), "odd")
 
 
-@pytest.mark.parametrize("stamps", [[0, 0, 0], [2, 1, 3]])
+@pytest.mark.parametrize("stamps", [[0, 0, 0], [2, 1, 3]], ids=str)
 def test_recording_times_replace_unusable_header_stamps(tmp_path, stamps, caplog):
     write_bag(tmp_path, "street", {"/points": plain_clouds(3)}, stamps=np.array(stamps))
     timestamps = rosbag(tmp_path).sequence("street").timestamps
@@ -167,11 +167,12 @@ def test_recording_times_replace_unusable_header_stamps(tmp_path, stamps, caplog
 @pytest.mark.parametrize(
     ("stamps", "left_out"),
     [
-        ({7: 6}, {6, 7}),  # the same twice
+        ({7: 6}, {6, 7}),
         ({7: 8, 8: 7}, {7, 8}),
         ({0: 10**6}, {0}),
-        ({12: -5000}, {12}),  # a stamp of zero
+        ({12: -5000}, {12}),
     ],
+    ids=["repeated", "swapped", "first too late", "zero"],
 )
 def test_cloud_with_stamp_out_of_order_is_dropped(tmp_path, stamps, left_out, caplog):
     write_bag(

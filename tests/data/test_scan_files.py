@@ -24,7 +24,11 @@ SECONDS = ["1583836591.22498.bin", "1583836592.0.bin", "1583836592.119722.bin", 
 NANOSECONDS = ["1583836591.1190722000.bin", "1583836592.22498.bin", "1583836592.119722000.bin"]
 
 
-@pytest.mark.parametrize("names", [SECONDS, [f"scan_{name}" for name in SECONDS], NANOSECONDS])
+@pytest.mark.parametrize(
+    "names",
+    [SECONDS, [f"scan_{name}" for name in SECONDS], NANOSECONDS],
+    ids=["seconds", "prefix", "nanoseconds"],
+)
 def test_scans_named_by_unix_time_are_in_order_of_time(tmp_path, names):
     """Floats as Python prints them, without trailing zeros; or nanoseconds without leading zeros."""
     for name in sorted(names):
@@ -41,6 +45,7 @@ def test_scans_named_by_unix_time_are_in_order_of_time(tmp_path, names):
         (["0000000010.bin", "0000000012.bin"], True),
         (["scan7.bin"], True),
     ],
+    ids=["seconds", "microseconds", "seconds_nanoseconds", "digits", "prefix"],
 )
 def test_names_of_times_are_not_scan_numbers(tmp_path, names, counted):
     for name in names:
@@ -84,6 +89,7 @@ def test_natural_key_orders_by_number_then_text():
 @pytest.mark.parametrize(
     ("given", "expected"),
     [(["09", 10], ("09", "10")), (4, ("04",)), ("08", ("08",)), ([], ())],
+    ids=str,
 )
 def test_sequence_names_pad_numbers_with_zeros(given, expected):
     assert sequence_names(given, digits=2) == expected

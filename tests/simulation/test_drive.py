@@ -120,7 +120,9 @@ def test_movers_occlude_static_world(highway):
 @pytest.mark.parametrize("distorted", [False, True])
 @pytest.mark.parametrize("yaw", [0.0, 0.5])
 @pytest.mark.parametrize(
-    ("body", "y"), [(box(14.0, 2.5, 4.0), 4.0), (box(14.0, 2.5, 4.0), -11.0), (box(30.0, 20.0, 5.0), 2.0)]
+    ("body", "y"),
+    [(box(14.0, 2.5, 4.0), 4.0), (box(14.0, 2.5, 4.0), -11.0), (box(30.0, 20.0, 5.0), 2.0)],
+    ids=["near", "far", "around the sensor"],
 )
 def test_mover_looks_like_static_body_at_its_place(body, y, yaw, distorted):
     """Also between the vertices of large triangles, and from inside."""
@@ -151,9 +153,9 @@ def test_scans_of_endless_tunnel_are_equal():
     assert np.abs(drive.ranges(1).astype(int) - still.ranges(1).astype(int)).max() <= 2
 
 
-@pytest.mark.parametrize("scene", [scenes.room(), scenes.street()])
+@pytest.mark.parametrize("scene", [scenes.room, scenes.street])
 def test_scenes_surround_sensor(scene):
-    drive = Drive(scene, poses=scenes.straight_path(2, 0.5), frames=2, sensor=CLEAN)
+    drive = Drive(scene(), poses=scenes.straight_path(2, 0.5), frames=2, sensor=CLEAN)
     assert len(drive.scan(0).points) > 0.6 * CLEAN.beams * CLEAN.columns
 
 
@@ -198,7 +200,7 @@ def test_drive_can_be_pickled_after_use():
 
 
 @pytest.mark.parametrize(
-    "change", [{"seed": 9}, {"frames": 7}, {"static": True}, {"speed": 5.0}, {"sensor": hdl64(128)}]
+    "change", [{"seed": 9}, {"frames": 7}, {"static": True}, {"speed": 5.0}, {"sensor": hdl64(128)}], ids=list
 )
 def test_fingerprint_depends_on_each_setting(change):
     settings = {"seed": 0, "frames": 5, "sensor": SENSOR}

@@ -50,31 +50,33 @@ def test_sheet_omits_masked_cells():
 
 
 @pytest.mark.parametrize(
-    "make",
+    "parameters",
     [
-        objects.car,
-        objects.van,
-        objects.lorry,
-        objects.pedestrian,
-        objects.tree,
-        objects.conifer,
-        objects.bush,
-        objects.lamp,
-        objects.sign,
-        objects.road_sign,
-        objects.bench,
-        objects.bollard,
-        objects.bin_or_box,
-        lambda rng: objects.wall(rng, 6.0),
-        lambda rng: objects.fence(rng, 6.0),
-        lambda rng: objects.hedge(rng, 6.0),
-        lambda rng: objects.gantry(rng, 15.0),
-        lambda rng: building(rng, 12.0, 9.0, 8.0),
-        lambda rng: hall(rng, 20.0, 12.0, 6.0),
+        (objects.car,),
+        (objects.van,),
+        (objects.lorry,),
+        (objects.pedestrian,),
+        (objects.tree,),
+        (objects.conifer,),
+        (objects.bush,),
+        (objects.lamp,),
+        (objects.sign,),
+        (objects.road_sign,),
+        (objects.bench,),
+        (objects.bollard,),
+        (objects.bin_or_box,),
+        (objects.wall, 6.0),
+        (objects.fence, 6.0),
+        (objects.hedge, 6.0),
+        (objects.gantry, 15.0),
+        (building, 12.0, 9.0, 8.0),
+        (hall, 20.0, 12.0, 6.0),
     ],
+    ids=lambda parameters: parameters[0].__name__,
 )
-def test_objects_have_plausible_size_and_touch_ground(make):
-    mesh = make(np.random.default_rng(0))
+def test_objects_have_plausible_size_and_touch_ground(parameters):
+    make, *size = parameters
+    mesh = make(np.random.default_rng(0), *size)
     assert np.isfinite(mesh.vertices).all()
     assert 0 <= mesh.triangles.min() and mesh.triangles.max() < len(mesh.vertices)
     assert mesh.vertices[:, 2].min() < 0.6

@@ -76,6 +76,7 @@ def test_directions_are_rotated_into_world():
         (vlp16(), 16, 15.0, -15.0),
         (os1_64(), 64, 21.2, -21.2),
     ],
+    ids=["hdl64", "hdl32", "hdl32_inverted", "vlp16", "os1_64"],
 )
 def test_sensor_models_have_beams_of_data_sheets(sensor, beams, top, bottom):
     assert sensor.beams == beams
@@ -83,7 +84,9 @@ def test_sensor_models_have_beams_of_data_sheets(sensor, beams, top, bottom):
     assert (np.diff(sensor.elevations_deg) < 0).all()
 
 
-@pytest.mark.parametrize("wrong", [{"max_range": 200.0}, {"columns": 0}, {"drop_out": 1.5}, {"min_range": 130.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"max_range": 200.0}, {"columns": 0}, {"drop_out": 1.5}, {"min_range": 130.0}], ids=str
+)
 def test_impossible_sensor_settings_are_refused(wrong):
     with pytest.raises(ValueError, match="a sensor needs"):
         replace(CLEAN, **wrong)
