@@ -22,9 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard"
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     folder = tmp_path_factory.mktemp("network") / "run"
-    return train(
-        configured(folder, "trainer.max_epochs=1", "~callbacks.images", frames=9, train_sequences=["0"]), "boxes"
-    )
+    return train(configured(folder, "trainer.max_epochs=1", frames=9, train_sequences=["0"]), "boxes")
 
 
 def results(folder):

@@ -1,5 +1,6 @@
 """Short trainings on the box world, composed as the command line would."""
 
+import functools
 from pathlib import Path
 
 import torch
@@ -28,14 +29,29 @@ _QUICK = (
 )
 
 
-def configured(run_dir: Path, *overrides: str, **drives) -> DictConfig:
-    """The config of `python train.py OVERRIDES` with `BoxDrives(**drives)` for its data."""
+@functools.cache
+def _composed(*choices: str) -> DictConfig:
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        config = compose(
-            "train", [f"run_dir={run_dir}", f"datamodule.cache_root={run_dir.parent}/cache", *_QUICK, *overrides]
-        )
+        return compose("train", ["run_dir=unset", *_QUICK, *choices])
+
+
+def configured(run_dir: Path, *overrides: str, draws: bool = False, **drives) -> DictConfig:
+    """The config of `python train.py OVERRIDES` with `BoxDrives(**drives)` for its data.
+
+    Args:
+        run_dir: the run folder.
+        overrides: `loss=icp`, `~callbacks.progress` and settings, as `trainer.max_epochs=2`.
+        draws: whether images and trajectories are drawn, which takes longer than the rest of an epoch.
+        drives: arguments of `BoxDrives`.
+    """
+    choices = [override for override in overrides if override.startswith(("loss=", "~"))]
+    settings = [override.removeprefix("+") for override in overrides if override not in choices]
+    config = _composed(*choices).copy()
     with open_dict(config):
+        config.merge_with_dotlist([f"run_dir={run_dir}", f"datamodule.cache_root={run_dir.parent}/cache", *settings])
         config.data = {"_target_": "tests.box_world.BoxDrives", **drives}
+        if not draws:
+            del config.callbacks.images, config.callbacks.trajectories
     OmegaConf.resolve(config)
     return config
 

@@ -12,6 +12,11 @@ from lidarlearn.training.callbacks import enlarged, normal_image, range_image, s
 from tests.box_world import SMALL, BoxSequence, cast
 from tests.training.runs import configured, images, predicted
 
+pytestmark = [
+    pytest.mark.usefixtures("small_network"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard"),
+]
+
 
 def test_empty_pixels_are_black_and_others_are_not():
     vertex_map = SMALL.vertex_map(cast(se3.identity()))
@@ -52,7 +57,6 @@ def test_enlarging_repeats_pixels():
     torch.testing.assert_close(large[:, ::12, ::6], image)
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
 def test_a_drive_is_drawn_as_the_network_predicts_it_after_that_epoch(tmp_path, monkeypatch):
     drawn = {}
 
@@ -62,17 +66,16 @@ def test_a_drive_is_drawn_as_the_network_predicts_it_after_that_epoch(tmp_path, 
 
     monkeypatch.setattr(callbacks, "trajectory_figure", figure)
     often = ("trainer.max_epochs=2", "trainer.num_sanity_val_steps=-1")
-    train(configured(tmp_path, *often, frames=9), data_name="boxes")
+    train(configured(tmp_path, *often, draws=True, frames=9), data_name="boxes")
     first, last = drawn.pop("sequence 2 after 1 epochs"), drawn.pop("sequence 2 after 2 epochs")
     expected = predicted(tmp_path / "checkpoints" / "last.ckpt", BoxSequence("2", 9))
     torch.testing.assert_close(last, expected, rtol=1e-4, atol=1e-4)
     assert not drawn and (first - last).abs().max() > 1e-2
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
 def test_images_are_drawn_as_often_as_validation_allows(tmp_path):
     seldom = [f"callbacks.{name}.every_n_epochs=3" for name in ("images", "trajectories")]
     often = ("trainer.max_epochs=6", "trainer.check_val_every_n_epoch=2", "+trainer.limit_train_batches=1")
-    train(configured(tmp_path, *seldom, *often, frames=5), data_name="boxes")
+    train(configured(tmp_path, *seldom, *often, draws=True, frames=5), data_name="boxes")
     epochs = images(tmp_path)
     assert len(epochs) == 4 and all(drawn == [1, 5] for drawn in epochs.values()), epochs

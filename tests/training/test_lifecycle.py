@@ -13,7 +13,10 @@ from lidarlearn.training.unsupervised import UnsupervisedModule
 from tests.box_world import SMALL, BoxDrives
 from tests.training.runs import configured, curves, images, predicted
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
+pytestmark = [
+    pytest.mark.usefixtures("small_network"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard"),
+]
 EPOCHS, FRAMES = 3, 33  # two drives of 32 pairs: eight batches of eight an epoch
 
 
@@ -21,10 +24,10 @@ LOSSES = ["weighted_icp", *(pytest.param(loss, marks=pytest.mark.slow) for loss 
 
 
 @pytest.fixture(scope="module", params=LOSSES)
-def run(request, tmp_path_factory):
+def run(request, tmp_path_factory, small_network):
     """A finished training with each of the losses."""
     folder = tmp_path_factory.mktemp(request.param) / "run"
-    config = configured(folder, f"loss={request.param}", f"trainer.max_epochs={EPOCHS}", frames=FRAMES)
+    config = configured(folder, f"loss={request.param}", f"trainer.max_epochs={EPOCHS}", draws=True, frames=FRAMES)
     best = train(config, data_name="boxes")
     return folder, best, request.param
 
@@ -146,7 +149,7 @@ def resumed(folder, ended, run_dir, loss, **drives):
     spoilt.mkdir()
     torch.save(content, spoilt / "last.ckpt")
     (spoilt / "best.ckpt").write_bytes((folder / "checkpoints" / "best.ckpt").read_bytes())
-    settings = (f"loss={loss}", f"trainer.max_epochs={EPOCHS + 1}", f"ckpt={spoilt}/last.ckpt", "~callbacks.images")
+    settings = (f"loss={loss}", f"trainer.max_epochs={EPOCHS + 1}", f"ckpt={spoilt}/last.ckpt")
     return load_checkpoint(train(configured(run_dir, *settings, frames=FRAMES, **drives), data_name="boxes"))
 
 

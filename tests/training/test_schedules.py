@@ -49,7 +49,7 @@ def test_a_training_goes_through_it_step_by_step(tmp_path):
     from lidarlearn.commands.train import train
 
     config = configured(
-        tmp_path / "run", "trainer.max_epochs=2", "scheduler=cosine", "optimizer.lr=0.001", "~callbacks.images",
+        tmp_path / "run", "trainer.max_epochs=2", "scheduler=cosine", "optimizer.lr=0.001",
         "trainer.log_every_n_steps=1", frames=17,
     )  # fmt: skip
     train(config, "boxes")
