@@ -46,7 +46,7 @@ PLANES = [
 
 
 @pytest.mark.parametrize(("normal", "distance"), PLANES)
-def test_a_noise_free_plane_has_exact_normals_towards_the_sensor(normal, distance):
+def test_normals_of_noise_free_plane_are_exact(normal, distance):
     true = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
     normals = normal_map(on_plane(true, distance))
     errors = angles_deg(normals, true)
@@ -55,13 +55,13 @@ def test_a_noise_free_plane_has_exact_normals_towards_the_sensor(normal, distanc
 
 
 @pytest.mark.parametrize(("normal", "distance"), PLANES)
-def test_nearly_every_pixel_of_a_plane_gets_a_normal(normal, distance):
+def test_most_pixels_of_plane_have_normals(normal, distance):
     vertices = on_plane(torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0), distance)
     shares = (normal_map(vertices) != 0).any(dim=0).sum() / activated(vertices).sum()
     assert shares > 0.8
 
 
-def test_normals_are_unit_or_zero_and_only_at_activated_pixels():
+def test_normals_are_unit_at_activated_pixels_or_zero():
     vertices = on_plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 1.73)
     vertices = vertices * (torch.rand(64, 720, generator=torch.Generator().manual_seed(0)) < 0.6)
     normals = normal_map(vertices)
@@ -70,8 +70,8 @@ def test_normals_are_unit_or_zero_and_only_at_activated_pixels():
     assert not (length[~activated(vertices)] > 0).any()
 
 
-def test_no_normal_leans_across_a_depth_jump():
-    """A wall 5 m ahead before one at 9 m: pixels at the edge see one of the two or nothing, never the gap."""
+def test_normals_do_not_mix_sides_of_depth_jump():
+    """A wall at 5 m in front of one at 9 m."""
     forward = torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64)
     vertices = on_plane(forward, 9.0)
     vertices[:, :, 300:361] = on_plane(forward, 5.0)[:, :, 300:361]
@@ -79,21 +79,21 @@ def test_no_normal_leans_across_a_depth_jump():
     assert len(errors) > 1000 and errors.max() < 0.1
 
 
-def test_a_jump_that_isolates_a_pixel_leaves_it_without_a_normal():
+def test_pixel_isolated_in_depth_has_no_normal():
     vertices = on_plane(torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64), 9.0)
     vertices[:, 30, 360] *= 0.5
     normals = normal_map(vertices)
     assert not normals[:, 30, 360].any() and normals[:, 30, 364].any()
 
 
-def test_a_single_row_or_column_of_points_has_no_normals():
+def test_single_row_or_column_has_no_normals():
     vertices = on_plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 1.73)
     row, column = torch.zeros_like(vertices), torch.zeros_like(vertices)
     row[:, 40], column[:, :, 100] = vertices[:, 40], vertices[:, :, 100]
     assert not normal_map(row).any() and not normal_map(column).any()
 
 
-def test_two_rows_are_enough():
+def test_two_rows_have_normals():
     vertices = on_plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 1.73)
     vertices[:, :40] = 0
     vertices[:, 42:] = 0
@@ -110,7 +110,7 @@ def test_two_rows_are_enough():
         ([(-2, 0), (-1, 0), (1, 0), (2, 0), (0, -1)], False),  # or column
     ],
 )
-def test_a_normal_needs_four_neighbours_in_other_rows_and_columns(neighbours, is_enough):
+def test_normal_needs_four_neighbours_in_other_rows_and_columns(neighbours, is_enough):
     floor = on_plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 1.73)
     vertices = torch.zeros_like(floor)
     for row, column in ((0, 0), *neighbours):
@@ -125,14 +125,14 @@ def test_rough_patches_have_no_normals():
     assert strict < 0.05 * generous
 
 
-def test_neighbours_are_found_across_the_seam():
+def test_neighbours_wrap_at_seam():
     vertices = on_plane(torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), 8.0)  # a wall behind the sensor
     rolled = normal_map(vertices.roll(360, dims=2)).roll(-360, dims=2)
     torch.testing.assert_close(normal_map(vertices), rolled)
     assert normal_map(vertices)[:, 40, [0, -1]].any(dim=0).all()
 
 
-def test_rows_do_not_wrap():
+def test_neighbours_do_not_wrap_across_rows():
     vertices = on_plane(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 1.73)
     only_top_and_bottom = torch.zeros_like(vertices)
     only_top_and_bottom[:, 63] = vertices[:, 63]
@@ -140,20 +140,20 @@ def test_rows_do_not_wrap():
     assert not normal_map(only_top_and_bottom).any()
 
 
-def test_long_range_costs_no_digits():
+def test_normals_are_exact_at_long_range():
     true = torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64)
     errors = angles_deg(normal_map(on_plane(true, 75.0)), true)
     assert len(errors) > 100 and errors.max() < 0.02
 
 
-def test_batches_are_treated_one_by_one():
+def test_batch_equals_single_maps():
     vertices = torch.stack([on_plane(torch.tensor(n, dtype=torch.float64), d) for n, d in PLANES[:3]])
     normals = normal_map(vertices[None])
     assert normals.shape == (1, 3, 3, 64, 720)
     assert torch.equal(normals[0, 1], normal_map(vertices[1]))
 
 
-def test_noise_turns_normals_without_bias():
+def test_noise_does_not_bias_normals():
     noisy = on_plane(torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64), 20.0)
     generator = torch.Generator().manual_seed(0)
     noisy = noisy * (1 + 0.0005 * torch.randn(64, 720, generator=generator))
@@ -172,7 +172,7 @@ def random_covariances(n: int, eigenvalues: list[float], dtype: torch.dtype) -> 
 
 
 @pytest.mark.parametrize("eigenvalues", [[0.0, 1, 1], [0.001, 1, 3], [1e-8, 1e-4, 2e-3], [0.2, 1, 5], [1e2, 1e4, 3e4]])
-def test_planes_agree_with_an_eigensolver(eigenvalues):
+def test_fit_planes_equals_eigensolver(eigenvalues):
     components, matrices = random_covariances(200, eigenvalues, torch.float64)
     plane = fit_planes(components)
     oracle = torch.linalg.eigh(matrices)
@@ -183,7 +183,7 @@ def test_planes_agree_with_an_eigensolver(eigenvalues):
     torch.testing.assert_close(plane.variances / scale, oracle.eigenvalues / scale, rtol=0, atol=1e-6)
 
 
-def test_planes_in_single_precision():
+def test_fit_planes_in_single_precision():
     components, matrices = random_covariances(500, [1e-4, 0.04, 0.1], torch.float32)
     normals = torch.linalg.eigh(matrices.double()).eigenvectors[..., 0]
     cosines = (fit_planes(components).normals * normals).sum(-1).abs()
@@ -191,6 +191,6 @@ def test_planes_in_single_precision():
 
 
 @pytest.mark.parametrize("components", [[0.0] * 6, [1.0, 0, 0, 0, 0, 0], [1.0, 0, 0, 1.0, 0, 1.0]])
-def test_sets_without_a_plane_give_finite_answers(components):
+def test_fit_planes_is_finite_without_plane(components):
     plane = fit_planes(torch.tensor([components]))
     assert torch.isfinite(plane.normals).all() and torch.isfinite(plane.variances).all()

@@ -22,7 +22,7 @@ def from_angles(azimuth_deg, elevation_deg, distance=1.0) -> torch.Tensor:
 
 
 def slow_nearest(projection: SphericalProjection, points: torch.Tensor) -> torch.Tensor:
-    """The formulas of the projection, point by point; the first of equally near points stays."""
+    """The formulas of the projection, point by point; the first of equally near points wins."""
     index = torch.full((projection.height, projection.width), -1)
     nearest = torch.full((projection.height, projection.width), math.inf)
     up, down = math.radians(projection.fov_up_deg), math.radians(projection.fov_down_deg)
@@ -39,18 +39,18 @@ def slow_nearest(projection: SphericalProjection, points: torch.Tensor) -> torch
 
 
 @pytest.mark.parametrize("projection", SENSORS)
-def test_agrees_with_the_formulas_point_by_point(projection):
+def test_projection_equals_formulas(projection):
     points = random_points(3000)
     points[:, 2] *= 0.3
     assert torch.equal(projection.nearest_points(points), slow_nearest(projection, points))
 
 
-def test_forward_is_the_middle_column_and_left_comes_before_it():
+def test_forward_is_middle_column_and_left_comes_before():
     column = SMALL.pixel_index(from_angles([90.0, 0.0, -90.0], -1.0)) % SMALL.width
     assert column.tolist() == [2, 5, 7]
 
 
-def test_the_seam_behind_the_sensor_wraps():
+def test_columns_wrap_behind_sensor():
     behind = from_angles([180.0, 180 - 1e-3, -180 + 1e-3, -180.0], -1.0)
     column = SMALL.pixel_index(behind) % SMALL.width
     assert column[1] == 0 and column[2] == SMALL.width - 1
@@ -59,18 +59,18 @@ def test_the_seam_behind_the_sensor_wraps():
     assert (SMALL.pixel_index(exactly) % SMALL.width == 0).all()
 
 
-def test_points_outside_the_field_of_view_and_at_the_origin_have_no_pixel():
+def test_points_out_of_view_or_at_origin_have_no_pixel():
     outside = torch.cat([from_angles(0.0, [30.1, -30.1, 89.9, -90.0]), torch.zeros(1, 3)])
     assert (SMALL.pixel_index(outside) == -1).all()
     assert not activated(SMALL.vertex_map(outside)).any()
 
 
-def test_points_on_the_vertical_axis_project_where_they_are_in_view():
+def test_points_on_vertical_axis_have_pixel_if_in_view():
     full = SphericalProjection(4, 8, 90.0, -91.0)
     assert (full.pixel_index(torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 1.9]])) >= 0).all()
 
 
-def test_the_nearest_point_wins_a_pixel_whatever_the_order():
+def test_nearest_point_wins_pixel_in_any_order():
     ray = from_angles(40.0, -3.0)
     points = torch.cat([5 * ray[None], 2 * ray[None], 9 * ray[None]])
     for order in ([0, 1, 2], [2, 1, 0], [1, 0, 2]):
@@ -78,7 +78,7 @@ def test_the_nearest_point_wins_a_pixel_whatever_the_order():
         assert torch.equal(image[:, activated(image)].T, points[1:2])
 
 
-def test_of_equally_near_points_the_first_wins():
+def test_first_of_equally_near_points_wins():
     base = torch.tensor([[3.0, 4.0, 0.0]])
     points = torch.cat([2 * base, base, base, base])
     assert HDL64.nearest_points(points).max() == 1
@@ -86,21 +86,21 @@ def test_of_equally_near_points_the_first_wins():
     assert shuffled.max() == 0
 
 
-def test_ties_among_many_points_give_the_same_image_every_time():
+def test_ties_are_deterministic():
     points = random_points(200).repeat(20, 1)
     images = [HDL64.nearest_points(points) for _ in range(3)]
     assert all(torch.equal(image, images[0]) for image in images) and images[0].max() < 200
 
 
 @pytest.mark.parametrize("projection", SENSORS)
-def test_a_vertex_map_projects_onto_itself(projection):
+def test_vertex_map_projects_onto_itself(projection):
     image = projection.vertex_map(random_points(4000))
     assert activated(image).sum() > 50
     assert torch.equal(projection.vertex_map(image[:, activated(image)].T), image)
 
 
 @pytest.mark.parametrize("projection", SENSORS)
-def test_every_pixel_can_be_reached_through_its_centre(projection):
+def test_pixel_centres_project_to_their_pixels(projection):
     row, column = torch.meshgrid(torch.arange(projection.height), torch.arange(projection.width), indexing="ij")
     span = projection.fov_up_deg - projection.fov_down_deg
     elevation = projection.fov_up_deg - (row + 0.5) / projection.height * span
@@ -108,20 +108,20 @@ def test_every_pixel_can_be_reached_through_its_centre(projection):
     assert projection.pixel_index(centres).tolist() == list(range(projection.pixels))
 
 
-def test_batches_are_projected_one_by_one():
+def test_batch_equals_single_scans():
     points = torch.stack([random_points(500, seed) for seed in range(6)]).view(2, 3, 500, 3)
     images = HDL64.vertex_map(points)
     assert images.shape == (2, 3, 3, 64, 720)
     assert torch.equal(images[1, 2], HDL64.vertex_map(points[1, 2]))
 
 
-def test_an_empty_scan_gives_an_empty_image():
+def test_empty_scan_gives_empty_image():
     assert not HDL64.vertex_map(torch.zeros(0, 3)).any()
     assert HDL64.vertex_map(torch.zeros(2, 0, 3)).shape == (2, 3, 64, 720)
     assert (HDL64.nearest_points(torch.zeros(0, 3)) == -1).all()
 
 
-def test_gradients_reach_the_points_that_won_and_no_others():
+def test_gradients_reach_nearest_points_only():
     points = random_points(400).double().requires_grad_()
     weights = torch.randn(3, 64, 720, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     (HDL64.vertex_map(points) * weights).sum().backward()
@@ -131,7 +131,7 @@ def test_gradients_reach_the_points_that_won_and_no_others():
     torch.testing.assert_close(points.grad, expected)
 
 
-def test_gradcheck_through_the_vertex_map():
+def test_gradcheck_of_vertex_map():
     points = from_angles([10.0, 100.0, -95.0, 10.0], [-2.0, -5.0, 1.0, -2.0], torch.tensor([[4.0], [7], [9], [8]]))
     assert torch.autograd.gradcheck(SMALL.vertex_map, (points.double().requires_grad_(),))
 
@@ -143,7 +143,7 @@ def test_impossible_images_are_refused(settings):
 
 
 @on_gpu
-def test_a_gpu_finds_the_same_nearest_points():
+def test_gpu_finds_same_nearest_points():
     """But for points on the border of a pixel, which may round to either side."""
     points = random_points(100_000, scale=30.0)
     here, there = HDL64.nearest_points(points), HDL64.nearest_points(points.cuda()).cpu()

@@ -1,4 +1,4 @@
-"""Rigid motions are a Lie group: its axioms over batch shapes, with scipy and the matrix exponential as oracles."""
+"""Rigid motions: axioms of a Lie group over batch shapes; scipy and the matrix exponential as oracles."""
 
 import math
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from lidarlearn.geometry import se3
 
 BATCHES = [(), (1,), (3, 1, 2)]
-ANGLES = [0.0, 1e-12, 1e-7, 1e-4, 0.0099, 0.0101, 0.5, 2.0, 3.1]  # 0.01 rad: where the series take over
+ANGLES = [0.0, 1e-12, 1e-7, 1e-4, 0.0099, 0.0101, 0.5, 2.0, 3.1]  # series below 0.01 rad
 
 
 def random_twists(*batch: int, angle: float | None = None, seed: int = 0) -> Tensor:
@@ -44,7 +44,7 @@ def test_group_axioms(batch):
 
 @pytest.mark.parametrize("batch", BATCHES)
 @pytest.mark.parametrize("angle", ANGLES)
-def test_exp_is_the_matrix_exponential(batch, angle):
+def test_exp_equals_matrix_exponential(batch, angle):
     xi = random_twists(*batch, angle=angle)
     assert_close(se3.exp(xi), torch.linalg.matrix_exp(hat6(xi)))
 
@@ -56,13 +56,13 @@ def test_log_inverts_exp(batch, angle):
     assert_close(se3.log(se3.exp(xi)), xi, atol=1e-11)
 
 
-def test_log_keeps_the_digits_of_tiny_rotations_in_single_precision():
+def test_log_of_tiny_rotations_in_single_precision():
     xi = random_twists(50, angle=1e-4).float()
     torch.testing.assert_close(se3.log(se3.exp(xi))[:, 3:], xi[:, 3:], rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_rotations_agree_with_scipy(angle):
+def test_rotations_equal_scipy(angle):
     phi = random_twists(20, angle=angle)[:, 3:]
     R = torch.from_numpy(Rotation.from_rotvec(phi.numpy()).as_matrix())
     assert_close(se3.exp(torch.cat([torch.zeros_like(phi), phi], dim=1))[:, :3, :3], R)
@@ -72,7 +72,7 @@ def test_rotations_agree_with_scipy(angle):
 
 
 @pytest.mark.parametrize("batch", BATCHES)
-def test_adjoint_moves_a_twist_to_the_other_side(batch):
+def test_conjugation_transforms_twist_by_adjoint(batch):
     T, xi = se3.exp(random_twists(*batch)), random_twists(*batch, angle=0.3, seed=1)
     moved = se3.log(T @ se3.exp(xi) @ se3.inverse(T))
     R, t = T[..., :3, :3], T[..., :3, 3]
@@ -81,13 +81,13 @@ def test_adjoint_moves_a_twist_to_the_other_side(batch):
     assert_close(moved, torch.cat([translation, rotation], dim=-1), atol=1e-11)
 
 
-def test_powers_of_one_twist_add_up():
+def test_motions_along_one_twist_add_up():
     xi = random_twists(5, angle=0.8)
     assert_close(se3.exp(0.3 * xi) @ se3.exp(0.7 * xi), se3.exp(xi))
 
 
 @pytest.mark.parametrize("batch", BATCHES)
-def test_transform_is_the_homogeneous_product_in_the_dtype_of_the_points(batch):
+def test_transform_is_homogeneous_product(batch):
     T = se3.exp(random_twists(*batch))
     points = torch.randn(*batch, 7, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     homogeneous = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
@@ -95,7 +95,7 @@ def test_transform_is_the_homogeneous_product_in_the_dtype_of_the_points(batch):
     assert se3.transform(T, points.float()).dtype == torch.float32
 
 
-def test_hat_is_the_cross_product():
+def test_hat_is_cross_product():
     v, w = random_twists(9)[:, :3], random_twists(9, seed=1)[:, :3]
     assert_close((se3.hat(v) @ w[..., None])[..., 0], torch.linalg.cross(v, w))
 
@@ -114,12 +114,12 @@ def test_euler_angles_round_trip(batch):
     assert_close(se3.to_euler(se3.from_euler(parameters)), parameters)
 
 
-def test_euler_angles_are_tangent_to_exp_at_the_identity():
+def test_euler_angles_are_tangent_to_exp_at_identity():
     xi = 1e-6 * random_twists(10)
     assert_close(se3.from_euler(xi), se3.exp(xi), atol=1e-11)
 
 
-def test_orthonormalize_finds_the_nearest_rotation():
+def test_orthonormalize_finds_nearest_rotation():
     T = se3.exp(random_twists(10))
     bent = T.clone()
     bent[:, :3, :3] += 1e-3 * random_twists(10, 3, seed=1)[..., :3]
@@ -147,31 +147,31 @@ def test_gradients(function, scale):
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-3, 0.7])
-def test_gradient_of_log_by_a_motion_of_the_pose(scale):
-    """The matrix is only ever moved within the group: its entries are no coordinates."""
+def test_gradient_of_log_with_respect_to_motion(scale):
+    """The matrix is only moved within the group."""
     T, zero = se3.exp(scale * random_twists(3)), torch.zeros(3, 6, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda d: se3.log(T @ se3.exp(d)), (zero,), atol=1e-7)
 
 
-def test_gradient_of_log_is_finite_at_the_identity_itself():
+def test_gradient_of_log_is_finite_at_identity():
     T = se3.identity(2).requires_grad_()
     se3.log(T).sum().backward()
     assert torch.isfinite(T.grad).all()
 
 
-def test_half_turns_are_as_far_as_log_reaches():
+def test_log_is_accurate_up_to_half_turns():
     xi = random_twists(8, angle=math.pi - 1e-5)
     assert_close(se3.log(se3.exp(xi)), xi, atol=1e-8)
 
 
 @pytest.mark.parametrize("batch", BATCHES)
-def test_vertex_maps_are_transformed_point_by_point(batch):
+def test_transform_map_equals_transform_of_points(batch):
     T = se3.exp(random_twists(*batch))
     maps = torch.randn(*batch, 3, 4, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert_close(se3.transform_map(T, maps).flatten(-2), se3.transform(T, maps.flatten(-2).mT).mT)
 
 
-def test_the_difference_of_motions_is_the_motion_between_them():
+def test_motion_difference_measures_motion_between():
     T_a = se3.exp(torch.tensor([1.2, 0.1, 0.0, 0.01, -0.02, 0.3], dtype=torch.float64))
     T_a_b = se3.exp(torch.tensor([0.3, 0.0, 0.4, 0.0, 0.0, math.radians(5)], dtype=torch.float64))
     difference = se3.motion_difference(T_a, T_a @ T_a_b)

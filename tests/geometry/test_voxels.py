@@ -13,7 +13,7 @@ def random_points(n: int, scale: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("scale", "size"), [(1.0, 0.4), (20.0, 0.4), (20.0, 1.0), (80.0, 5.0)])
-def test_grid_sampling_keeps_one_point_of_every_voxel_in_the_order_of_the_voxels(scale, size):
+def test_grid_sample_keeps_one_point_per_voxel_in_order(scale, size):
     points = random_points(3000, scale)
     occupied = {tuple(math.floor(x) for x in (point / size).tolist()) for point in points}
     kept = grid_sample(points, size)
@@ -21,8 +21,8 @@ def test_grid_sampling_keeps_one_point_of_every_voxel_in_the_order_of_the_voxels
     assert cells == sorted(occupied)
 
 
-def test_which_point_is_kept_does_not_depend_on_its_place_in_the_scan():
-    """A spinning LiDAR lists its points beam by beam: the first of each voxel would lie on the same side of it."""
+def test_grid_sample_does_not_prefer_first_points():
+    """A spinning LiDAR lists its points beam by beam, so the first of each voxel would lie on the same side of it."""
     voxels, each = 400, 50
     points = torch.arange(voxels).repeat(each)[:, None] + torch.full((1, 3), 0.5)
     rank = grid_sample(points, 1.0) // voxels
@@ -30,34 +30,34 @@ def test_which_point_is_kept_does_not_depend_on_its_place_in_the_scan():
     assert rank.double().mean() == pytest.approx((each - 1) / 2, abs=4 * each / math.sqrt(12 * voxels))
 
 
-def test_cells_do_not_fold_around_the_origin():
+def test_cells_round_down_below_zero():
     points = torch.tensor([[-0.1, 0.1, -0.5], [0.1, -0.1, 0.5]])
     assert voxel_cells(points, 0.4).tolist() == [[-1, 0, -2], [0, -1, 1]]
 
 
-def test_sampling_twice_changes_nothing():
+def test_grid_sample_is_idempotent():
     points = random_points(2000, 10.0)
     once = points[grid_sample(points, 0.5)]
     assert torch.equal(grid_sample(once, 0.5), torch.arange(len(once)))
 
 
-def test_an_empty_scan_has_no_voxels():
+def test_grid_sample_of_empty_scan_is_empty():
     assert grid_sample(torch.zeros(0, 3), 0.4).shape == (0,)
 
 
-def test_keys_are_one_to_one_within_a_million_cells():
+def test_keys_are_unique_within_a_million_cells():
     edge = (1 << 20) - 1
     values = torch.tensor([-edge - 1, -edge, -1, 0, 1, edge])
     cells = torch.cartesian_prod(values, values, values)
     assert len(voxel_keys(cells).unique()) == len(cells)
 
 
-def test_cells_take_any_batch_shape():
+def test_cells_have_any_batch_shape():
     points = random_points(24, 5.0).view(2, 3, 4, 3)
     assert torch.equal(voxel_cells(points, 0.3)[1, 2], voxel_cells(points[1, 2], 0.3))
 
 
-def test_sums_over_parts_are_those_over_everything():
+def test_sums_over_parts_equal_sums_over_whole():
     points = random_points(3000, 3.0)
     cells, sums = voxel_cells(points, 0.5), VoxelSums(3)
     for part in torch.arange(3000).split(700):
@@ -68,7 +68,7 @@ def test_sums_over_parts_are_those_over_everything():
     torch.testing.assert_close(summed, torch.zeros(len(once), 3).index_add_(0, voxel, points))
 
 
-def test_the_memory_of_sums_goes_by_the_voxels(monkeypatch):
+def test_memory_of_sums_is_bounded_by_voxels(monkeypatch):
     monkeypatch.setattr(VoxelSums, "_MIN_WAITING", 0)
     points = random_points(3000, 3.0)
     cells, sums = voxel_cells(points, 0.5), VoxelSums(1)
@@ -85,7 +85,7 @@ def test_sums_over_nothing_are_empty():
 
 
 @on_gpu
-def test_a_gpu_samples_the_same_points():
+def test_gpu_samples_same_points():
     """The first call is eager, the second is captured, the third replayed."""
     graphs = GraphCache()
     for seed in range(4):

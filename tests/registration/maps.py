@@ -1,4 +1,4 @@
-"""Maps of generated scenes for the three associations, and a scan to register against them."""
+"""Maps of simulated scenes for each association, and a scan to register against them."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -22,7 +22,7 @@ _MAP_SCANS = 4
 
 @dataclass(frozen=True)
 class Scene:
-    """A map of the scans before the new one, and where the new one truly is."""
+    """A map of the scans before the new one, and the points and true pose of the new one."""
 
     association: Association
     queries: Tensor
@@ -43,17 +43,16 @@ def drive(name: str, frames: int = _MAP_SCANS + 1) -> Drive:
 
 @cache
 def scene(name: str, association: str) -> Scene:
-    """Built as the backends build it; maps are only searched from then on."""
-    way = drive(name)
+    """Built as in the backends; not to be modified."""
+    scans = drive(name)
     sampling, searchable = make(association)
     for i in range(_MAP_SCANS):
-        points = way.scan(i).points
-        searchable.insert(sampling.sample(points).points, way.T_world_lidar[i], 30)
-    sampled = sampling.sample(way.scan(_MAP_SCANS).points)
+        searchable.insert(sampling.sample(scans.scan(i).points).points, scans.T_world_lidar[i], 30)
+    sampled = sampling.sample(scans.scan(_MAP_SCANS).points)
     normals = neighbourhood_normals(sampled.points, 0.4)[sampled.queries]
     queries = sampled.points[sampled.queries]
     stride = 4 if association == "p" else 1
-    return Scene(searchable, queries[::stride], normals[::stride], way.T_world_lidar[_MAP_SCANS])
+    return Scene(searchable, queries[::stride], normals[::stride], scans.T_world_lidar[_MAP_SCANS])
 
 
 def make(association: str) -> tuple[Sampling, Association]:

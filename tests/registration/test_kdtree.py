@@ -14,7 +14,7 @@ def clouds() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("max_distance", [0.2, 0.5, 3.0])
-def test_is_exactly_brute_force(max_distance):
+def test_search_equals_brute_force(max_distance):
     points, queries = clouds()
     tree = KdTree(voxel_size_m=0.01)  # as good as no grid sampling
     tree.insert(points, T_WORLD, frames=1)
@@ -27,7 +27,7 @@ def test_is_exactly_brute_force(max_distance):
     torch.testing.assert_close(distances[found.mask], nearest.values[found.mask], rtol=0, atol=1e-5)
 
 
-def test_searches_the_latest_map():
+def test_search_uses_latest_map():
     tree = KdTree()
     points, queries = clouds()
     tree.insert(points, se3.identity(), frames=1)
@@ -38,7 +38,7 @@ def test_searches_the_latest_map():
     assert tree.search(queries + 1000, 1.0).mask.any()
 
 
-def test_normals_belong_to_the_points_found():
+def test_normals_are_those_of_found_points():
     scene = maps.scene("room", "kd")
     floor = torch.cartesian_prod(torch.linspace(-5, 5, 11), torch.linspace(-3, 3, 7), torch.tensor([-1.73]))
     found = scene.association.search(floor, 0.5)

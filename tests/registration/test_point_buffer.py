@@ -3,7 +3,7 @@ import torch
 from lidarlearn.registration.association.point_buffer import PointBuffer
 
 
-def test_the_last_scans_stand_behind_each_other_however_often_the_buffers_are_full():
+def test_buffer_keeps_order_of_last_scans_when_full():
     generator = torch.Generator().manual_seed(0)
     buffer, scans = PointBuffer(torch.device("cpu")), []
     for length in torch.randint(0, 30_000, (40,), generator=generator).tolist():
@@ -18,7 +18,7 @@ def test_the_last_scans_stand_behind_each_other_however_often_the_buffers_are_fu
         assert buffer.scans.tolist() == expected
 
 
-def test_fewer_scans_can_be_kept_later_on():
+def test_window_can_shrink():
     buffer = PointBuffer(torch.device("cpu"))
     for scans in (3, 3, 3, 1):
         buffer.forget(scans - 1)

@@ -1,5 +1,3 @@
-import math
-
 import pytest
 import torch
 from torch import Tensor
@@ -22,31 +20,29 @@ def poses() -> Tensor:
     return maps.drive("street").T_world_lidar
 
 
-def slow_search(frames: list[tuple[Tensor, Tensor]], T_world_image: Tensor, query: Tensor) -> Tensor | None:
-    """The paper's words: every frame projected into the image of one scan; of the query's pixel, the closest in 3D.
+def slow_search(frames: list[tuple[Tensor, Tensor]], T_world_image: Tensor, queries: Tensor) -> list[Tensor | None]:
+    """As in the paper: every frame is projected into one image; of a query's pixel, the closest in 3D.
 
     `frames` holds the points with normals of each scan, and its pose.
     """
-    T_lidar_world = se3.inverse(T_world_image)
-    pixel = SMALL.pixel_index(se3.transform(T_lidar_world, query[None]))[0]
-    best, smallest = None, math.inf
+    T_image_world, projected = se3.inverse(T_world_image), []
     for points, T_world in frames:
-        local = se3.transform(T_lidar_world @ T_world, points)
-        same = SMALL.pixel_index(local) == pixel
-        if pixel < 0 or not same.any():
-            continue
-        nearest = se3.transform(T_world, points)[same][local[same].norm(dim=1).argmin()]
-        if (nearest - query).norm() < smallest:
-            best, smallest = nearest, (nearest - query).norm().item()
-    return best
+        local = se3.transform(T_image_world @ T_world, points)
+        projected.append((SMALL.pixel_index(local), local.norm(dim=1), se3.transform(T_world, points)))
+    found = []
+    for query, pixel in zip(queries, SMALL.pixel_index(se3.transform(T_image_world, queries)), strict=True):
+        in_pixel = [(ranges[pixels == pixel], world[pixels == pixel]) for pixels, ranges, world in projected]
+        nearest = [world[ranges.argmin()] for ranges, world in in_pixel if pixel >= 0 and len(ranges)]
+        found.append(min(nearest, key=lambda point: (point - query).norm().item(), default=None))
+    return found
 
 
 @pytest.mark.parametrize(
     ("image_distance_m", "inserted", "frames", "image"),
     [(0.0, 3, 30, 2), (0.0, 4, 2, 3), (100.0, 4, 2, 0)],
-    ids=["every scan begins an image", "the oldest are forgotten", "scans are added to an image from near by"],
+    ids=["new image for every scan", "oldest scans forgotten", "scans added to image nearby"],
 )
-def test_agrees_with_the_words_of_the_paper(scans, image_distance_m, inserted, frames, image):
+def test_search_equals_that_of_paper(scans, image_distance_m, inserted, frames, image):
     association, kept = Projective(SMALL, image_distance_m=image_distance_m), []
     for i in range(inserted):
         association.insert(scans[i], poses()[i], frames)
@@ -55,9 +51,8 @@ def test_agrees_with_the_words_of_the_paper(scans, image_distance_m, inserted, f
     queries = se3.transform(poses()[3], scans[3][::97])
     found = association.search(queries, 2.0)
     agreeing = 0
-    for i, query in enumerate(queries):
-        expected = slow_search(kept[-frames:], poses()[image], query)
-        if expected is None or (expected - query).norm() > 2.0:
+    for i, expected in enumerate(slow_search(kept[-frames:], poses()[image], queries)):
+        if expected is None or (expected - queries[i]).norm() > 2.0:
             agreeing += not found.mask[i]
         else:
             agreeing += bool(found.mask[i]) and torch.allclose(found.points[i], expected, atol=1e-4)
@@ -65,7 +60,7 @@ def test_agrees_with_the_words_of_the_paper(scans, image_distance_m, inserted, f
     assert agreeing >= len(queries) - 2  # a point on the border of a pixel may round to either side
 
 
-def test_a_scan_finds_itself(scans):
+def test_scan_finds_its_own_points(scans):
     association = Projective(SphericalProjection())
     association.insert(scans[0], poses()[0], frames=30)
     vertices = association.projection.vertex_map(scans[0])
@@ -76,7 +71,7 @@ def test_a_scan_finds_itself(scans):
     assert (found.normals[found.mask].norm(dim=1) - 1).abs().max() < 1e-4
 
 
-def test_the_window_forgets_the_oldest_scans(scans):
+def test_window_forgets_oldest_scans(scans):
     window, alone = Projective(SMALL), Projective(SMALL)
     for i in range(4):
         window.insert(scans[i], poses()[i], frames=2)
@@ -101,7 +96,7 @@ def test_more_scans_find_closer_points(scans):
 
 
 @pytest.mark.parametrize(
-    ("xi", "begins"),
+    ("xi", "starts"),
     [
         pytest.param((1.9, 0, 0, 0, 0, 0), False, id="near"),
         pytest.param((2.1, 0, 0, 0, 0, 0), True, id="far"),
@@ -109,17 +104,17 @@ def test_more_scans_find_closer_points(scans):
         pytest.param((0, 0, 0, 0, 0, 2.0), False, id="turned"),
     ],
 )
-def test_an_image_lasts_until_the_sensor_is_elsewhere_or_tilted(scans, xi, begins):
+def test_distance_or_tilt_starts_new_image(scans, xi, starts):
     association = Projective(SMALL, image_distance_m=2.0)
     T_world_lidar = se3.exp(torch.tensor(xi, dtype=torch.float64))
     for T in (se3.identity(), se3.identity(), T_world_lidar):
         association.insert(scans[0], T, frames=2)
     ahead = torch.tensor([[10.0, 0.0, -1.0]])
-    seen_from = T_world_lidar if begins else se3.identity()
+    seen_from = T_world_lidar if starts else se3.identity()
     assert torch.equal(association.bins(se3.transform(seen_from, ahead)), SMALL.pixel_index(ahead))
 
 
-def test_an_image_lasts_though_its_points_move_in_memory(scans, monkeypatch):
+def test_image_stays_valid_when_buffer_moves(scans, monkeypatch):
     queries, found = torch.cat([se3.transform(poses()[i], scans[i][::31]) for i in range(4)]), []
     for capacity in (1 << 16, 1):
         monkeypatch.setattr(point_buffer, "_INITIAL_CAPACITY", capacity)
@@ -131,14 +126,14 @@ def test_an_image_lasts_though_its_points_move_in_memory(scans, monkeypatch):
         assert a.mask.any() and torch.equal(a.mask, b.mask) and torch.equal(a.points[a.mask], b.points[b.mask])
 
 
-def test_out_of_view_is_not_associated(scans):
+def test_points_out_of_view_find_nothing(scans):
     association = Projective(SMALL)
     association.insert(scans[0], poses()[0], frames=30)
     overhead = torch.tensor([[0.0, 0.0, 5.0], [2.0, 0.0, 9.0], [0.0, 0.0, 0.0]])
     assert not association.search(overhead, 100.0).mask.any()
 
 
-def test_normals_turn_with_the_scan(scans):
+def test_normals_turn_with_scan(scans):
     T = se3.exp(torch.tensor([5.0, 1, 0, 0.2, -0.1, 1.0], dtype=torch.float64))
     straight, turned = Projective(SMALL), Projective(SMALL)
     straight.insert(scans[0], se3.identity(), frames=1)

@@ -36,7 +36,7 @@ def moved(problem: dict[str, Tensor], xi: Tensor) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("residual", RESIDUALS[:2])
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3)])
-def test_jacobians_agree_with_numerical_differentiation(residual: Residual, batch):
+def test_jacobians_equal_numerical_differentiation(residual: Residual, batch):
     problem, h = correspondences(batch), 1e-6
     jacobians = residual.linearize(**problem)
     for axis in range(6):
@@ -48,8 +48,8 @@ def test_jacobians_agree_with_numerical_differentiation(residual: Residual, batc
 
 
 @pytest.mark.parametrize("residual", RESIDUALS[2:])
-def test_the_jacobian_of_generalized_icp_holds_the_whitening_fixed(residual: Residual):
-    """As in Segal et al.: covariances are those of the current pose. With them held, residuals turn linear."""
+def test_jacobian_of_generalized_icp_holds_whitening_fixed(residual: Residual):
+    """As in Segal et al., covariances are those of the current pose; residuals are then linear."""
     problem, h = correspondences(), 1e-6
     linear = residual.linearize(**problem)
     for axis in range(6):
@@ -65,27 +65,27 @@ def test_the_jacobian_of_generalized_icp_holds_the_whitening_fixed(residual: Res
         torch.testing.assert_close(linear[..., axis], numerical, rtol=1e-6, atol=1e-7)
 
 
-def test_point_to_plane_is_the_signed_distance():
+def test_point_to_plane_is_signed_distance():
     problem = correspondences()
     problem["map_points"] = problem["points_world"] - 0.25 * problem["map_normals"]
     residuals = PointToPlane().linearize(**problem)[..., 6]
     torch.testing.assert_close(residuals, torch.full_like(residuals, 0.25))
 
 
-def test_sliding_along_the_plane_costs_nothing():
+def test_point_to_plane_ignores_offsets_along_plane():
     problem = correspondences()
     along = torch.linalg.cross(problem["map_normals"], torch.tensor([0.3, -0.8, 0.5]).double().expand(12, 3))
     problem["map_points"] = problem["points_world"] + along
     assert PointToPlane().linearize(**problem)[..., 6].abs().max() < 1e-12
 
 
-def test_without_a_normal_point_to_plane_says_nothing():
+def test_point_to_plane_without_normal_is_zero():
     problem = correspondences()
     problem["map_normals"] = torch.zeros_like(problem["map_normals"])
     assert not PointToPlane().linearize(**problem).any()
 
 
-def test_generalized_icp_is_the_mahalanobis_distance():
+def test_generalized_icp_is_mahalanobis_distance():
     problem, epsilon = correspondences(), 1e-2
     residuals = GeneralizedIcp(epsilon).linearize(**problem)[..., 6]
     R = problem["T_world_lidar"][:3, :3]
@@ -99,8 +99,8 @@ def test_generalized_icp_is_the_mahalanobis_distance():
 
 
 @pytest.mark.parametrize("share", [1.0, 0.0])
-def test_generalized_icp_of_parallel_planes_is_the_point_to_plane_distance(share: float):
-    """A point without a normal lies on the surface that it is matched with."""
+def test_generalized_icp_of_parallel_planes_is_point_to_plane(share: float):
+    """A point without a normal is taken to lie on the surface that it is matched with."""
     problem = correspondences()
     problem["normals"] = share * problem["map_normals"] @ problem["T_world_lidar"][:3, :3]
     size = GeneralizedIcp(1e-6).linearize(**problem)[..., 6].norm(dim=-1)

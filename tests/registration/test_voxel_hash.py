@@ -19,7 +19,7 @@ def both(request) -> tuple[KdTree, VoxelHash, torch.Tensor]:
 
 
 @pytest.mark.parametrize("distance", [VOXEL, 0.5, 0.8, 1.1, 1.6])
-def test_it_is_exact_up_to_four_voxel_edges(both, distance, record_property):
+def test_search_is_exact_up_to_four_voxel_edges(both, distance, record_property):
     tree, table, queries = both
     generator = torch.Generator().manual_seed(1)
     queries = queries + distance / 3 * torch.randn(queries.shape, generator=generator)
@@ -32,7 +32,7 @@ def test_it_is_exact_up_to_four_voxel_edges(both, distance, record_property):
     assert same.double().mean() > 0.999  # but for ties
 
 
-def test_the_widest_search_finds_a_neighbour_wherever_four_edges_reach(both):
+def test_widest_search_reaches_four_voxel_edges(both):
     tree, table, queries = both
     shifted = queries + torch.tensor([0.0, 0.0, 1.0])
     exact, found = tree.search(shifted, 3.0), table.search(shifted, 3.0)
@@ -40,7 +40,7 @@ def test_the_widest_search_finds_a_neighbour_wherever_four_edges_reach(both):
     assert near.sum() > 200 and found.mask[near].all()
 
 
-def test_a_search_in_pieces_is_the_search_at_once(both, monkeypatch):
+def test_search_in_pieces_equals_search_at_once(both, monkeypatch):
     _, table, queries = both
     whole = table.search(queries, 1.6)
     monkeypatch.setattr("lidarlearn.registration.association.voxel_hash._MAX_CANDIDATES_AT_ONCE", 10_000)
@@ -49,8 +49,8 @@ def test_a_search_in_pieces_is_the_search_at_once(both, monkeypatch):
     assert torch.equal(whole.points[whole.mask], pieces.points[whole.mask])
 
 
-def test_voxels_that_share_a_slot_of_the_table_are_told_apart():
-    """The table wraps around in space: what stands 512 voxels away must not be taken for a neighbour."""
+def test_voxels_with_same_table_entry_are_distinguished():
+    """The table wraps around in space, every 512 or 64 voxels."""
     table = VoxelHash(VOXEL)
     points = torch.tensor([[0.2, 0.2, 0.2], [30.2, 0.2, 0.2]])
     table.insert(points, se3.identity(), frames=30)
@@ -60,7 +60,7 @@ def test_voxels_that_share_a_slot_of_the_table_are_told_apart():
     assert table.search(points, VOXEL).mask.all()
 
 
-def test_normals_are_those_of_the_tree(both):
+def test_normals_equal_those_of_kdtree(both):
     tree, table, queries = both
     exact, found = tree.search(queries, VOXEL), table.search(queries, VOXEL)
     same = exact.mask & found.mask & (exact.points == found.points).all(dim=1)

@@ -27,13 +27,13 @@ RESIDUALS = torch.linspace(-3, 3, 601, dtype=torch.float64)
         (Cauchy(0.1), -0.3, 9.0, 0.1),
     ],
 )
-def test_closed_forms(kernel, residual, distance, expected):
+def test_weights_equal_closed_forms(kernel, residual, distance, expected):
     weight = kernel.weight(torch.tensor([residual]), torch.tensor([distance**2]))
     assert weight.item() == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_weights_are_one_at_zero_and_fall_symmetrically(kernel):
+def test_weights_fall_symmetrically_from_one_at_zero(kernel):
     weights = kernel.weight(RESIDUALS, RESIDUALS**2)
     assert weights[300] == 1 and (weights >= 0).all() and (weights <= 1).all()
     assert (weights[300:].diff() <= 0).all()
@@ -48,7 +48,7 @@ def test_weights_are_one_at_zero_and_fall_symmetrically(kernel):
         (Cauchy(0.3), lambda r: 0.3**2 / 2 * torch.log1p((r / 0.3) ** 2)),
     ],
 )
-def test_weights_are_those_of_the_robust_cost_they_are_named_after(kernel, rho):
+def test_weights_minimize_robust_cost_of_their_name(kernel, rho):
     """Iteratively reweighted least squares minimizes rho when w(r) = rho'(r) / r."""
     r = RESIDUALS.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(rho(r).sum(), r)
@@ -58,11 +58,11 @@ def test_weights_are_those_of_the_robust_cost_they_are_named_after(kernel, rho):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("shape", [(), (0,), (3, 1, 2)])
-def test_any_batch_shape(kernel, shape):
+def test_weights_have_shape_of_residuals(kernel, shape):
     assert kernel.weight(torch.zeros(shape), torch.zeros(shape)).shape == shape
 
 
-def test_a_weight_of_ones_own_may_have_a_shape_beside_its_scale():
+def test_custom_weight_may_have_further_parameters():
     @dataclass(frozen=True)
     class Barron(RobustWeight):
         alpha: float = -2.0

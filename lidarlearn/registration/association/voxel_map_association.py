@@ -22,11 +22,13 @@ class VoxelMapAssociation(Association):
     def __init__(self, voxel_size_m: float = 0.4, device: torch.device | str = "cpu") -> None:
         self._device = torch.device(device)
         self._voxel_size_m = voxel_size_m
+        self._map = VoxelMap(voxel_size_m, self._device)
         self.clear()
 
     def clear(self) -> None:
         """Forget every scan."""
-        self._map = VoxelMap(self._voxel_size_m, self._device)
+        if len(self._map):  # an unused map is kept, as a new one takes 30 ms
+            self._map = VoxelMap(self._voxel_size_m, self._device)
 
     def insert(self, points: Float[Tensor, "n 3"], T_world_lidar: Float[Tensor, "4 4"], frames: int) -> None:
         """Add a registered scan."""
