@@ -1,9 +1,9 @@
-"""The rules of the house that no reader of a single file can see."""
+"""Rules that concern the package as a whole: dependencies, imports, encodings, length of files."""
 
 import ast
+import functools
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,14 +14,23 @@ PACKAGE = Path(lidarlearn.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 
-def imports_of(path: Path) -> Iterator[str]:
-    """Full names of all modules that a file imports, wherever in it."""
-    for node in ast.walk(ast.parse(path.read_text())):
+@functools.cache
+def nodes(path: Path) -> list[ast.AST]:
+    """The syntax tree of a file, flattened."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+@functools.cache
+def imports_of(path: Path) -> frozenset[str]:
+    """Full names of all modules that a file imports, at any depth."""
+    names = set()
+    for node in nodes(path):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute"
-            yield node.module or ""
+            names.add(node.module or "")
+    return frozenset(names)
 
 
 def importing(library: str) -> set[str]:
@@ -40,21 +49,21 @@ def packages_used_by(package: str) -> set[str]:
     return {name for name in used if (PACKAGE / name).is_dir()}
 
 
-def test_there_is_something_to_look_at():
+def test_modules_are_found():
     assert len(MODULES) > 50 and importing("torch")
 
 
-def test_only_training_and_the_datamodule_import_lightning():
+def test_only_training_and_datamodule_import_lightning():
     allowed = {"data/datamodule.py", "commands/entry_point.py", "commands/train.py"}  # entry points start trainers
     assert {m for m in importing("lightning") if not m.startswith("training/")} <= allowed
 
 
 @pytest.mark.parametrize("library", ["hydra", "omegaconf"])
-def test_only_the_commands_and_training_import_hydra(library):
+def test_only_commands_and_training_import_hydra(library):
     assert not {m for m in importing(library) if not m.startswith(("commands/", "training/"))}
 
 
-def test_one_module_imports_open3d_and_only_when_it_is_needed():
+def test_only_raycasting_imports_open3d_and_lazily():
     assert importing("open3d") == {"simulation/raycasting.py"}
     tree = ast.parse((PACKAGE / "simulation/raycasting.py").read_text())
     top_level = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
@@ -76,18 +85,18 @@ def test_dependencies_point_one_way(package, may_use):
     assert packages_used_by(package) <= may_use
 
 
-def test_nothing_that_computes_knows_the_commands():
+def test_only_commands_import_commands():
     users = [path for path in MODULES if any(name.startswith("lidarlearn.commands") for name in imports_of(path))]
     assert {path.relative_to(PACKAGE).parts[0] for path in users if path.name != "__main__.py"} <= {"commands"}
 
 
-def test_there_is_no_drawer_for_odds_and_ends():
+def test_no_module_is_named_utils():
     assert not [path for path in MODULES if {"utils", "helpers", "misc", "common"} & set(path.with_suffix("").parts)]
     assert not [path for path in MODULES if any("utils" in name for name in imports_of(path) if "lidarlearn" in name)]
 
 
-def test_imports_stay_light():
-    """One process imports more and more: what a later module may not load, none before it may."""
+def test_imports_do_not_load_heavy_libraries():
+    """One process imports all modules in turn: what one must not load, those before it must not load either."""
     heavy = {
         "lidarlearn": {"torch", "open3d", "lightning", "hydra", "cv2", "scipy", "matplotlib"},
         "lidarlearn.odometry": {"open3d", "lightning", "hydra", "matplotlib", "torchvision"},
@@ -102,8 +111,8 @@ def test_imports_stay_light():
         assert not unwanted & set(loaded.split()), module
 
 
-def leaves_encoding_to_the_machine(node: ast.AST) -> bool:
-    """Whether a call reads or writes text in whatever encoding the locale has."""
+def is_text_access_without_encoding(node: ast.AST) -> bool:
+    """Whether a call reads or writes text in the encoding of the locale."""
     if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
         return False
     binary = any(isinstance(a, ast.Constant) and a.value in ("rb", "wb", "ab") for a in node.args)
@@ -111,13 +120,13 @@ def leaves_encoding_to_the_machine(node: ast.AST) -> bool:
     return is_text and not any(keyword.arg == "encoding" for keyword in node.keywords)
 
 
-def test_text_is_utf_8_on_every_machine():
-    """Names of sequences are anything, and Hydra reads UTF-8."""
+def test_text_files_are_opened_with_explicit_encoding():
+    """Names of sequences may have any characters, and Hydra reads UTF-8."""
     lines = {
         f"{path.relative_to(PACKAGE)}:{node.lineno}"
         for path in MODULES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if leaves_encoding_to_the_machine(node)
+        for node in nodes(path)
+        if is_text_access_without_encoding(node)
     }
     assert not lines
 

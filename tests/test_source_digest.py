@@ -1,4 +1,4 @@
-"""Digests of code: they follow what is imported, and nothing else."""
+"""Digests of code depend on the modules that it imports, and on no others."""
 
 import functools
 import importlib
@@ -46,7 +46,7 @@ def package(tmp_path, monkeypatch):
         ("other.py", False, False),
     ],
 )
-def test_a_digest_follows_the_imports(package, changed, matters, matters_within_data):
+def test_digest_depends_on_imported_modules(package, changed, matters, matters_within_data):
     def digests():
         source_digest.cache_clear()
         start = package / "reader.py"
@@ -58,7 +58,7 @@ def test_a_digest_follows_the_imports(package, changed, matters, matters_within_
     assert [a != b for a, b in zip(before, after, strict=True)] == [matters, matters_within_data]
 
 
-def test_relative_imports_are_followed(package):
+def test_digest_follows_relative_imports(package):
     found = module._with_imports((package / "data" / "writer.py",), package)
     assert {path.name for path in found} >= {"layout.py", "near.py", "er.py", "far.py"}
     assert "other.py" not in {path.name for path in found}
@@ -73,7 +73,7 @@ def test_relative_imports_are_followed(package):
         ('def f(x):\n    "one"\n    "two"\n    return x + 1\n', False),
     ],
 )
-def test_words_do_not_count(package, code, same):
+def test_digest_ignores_comments_and_docstrings(package, code, same):
     path, digests = package / "other.py", []
     for content in ('"""Adds."""\ndef f(x):\n    return x + 1\n', code):
         path.write_text(content)
@@ -90,7 +90,7 @@ def test_words_do_not_count(package, code, same):
         ("data/cache.py", ".", {"projection.py", "ranges.py"}, {"datamodule.py", "pairs.py"}),
     ],
 )
-def test_what_is_kept_depends_on_the_code_that_makes_it(start, within, needed, idle):
+def test_digest_of_package_module_covers_its_imports(start, within, needed, idle):
     found = {path.name for path in module._with_imports((module.PACKAGE / start,), (module.PACKAGE / within).resolve())}
     assert needed <= found and not idle & found
 
@@ -119,7 +119,7 @@ partial = __import__("functools").partial(build)
 
 @pytest.fixture
 def outside(package, monkeypatch):
-    """Somebody's modules, that import one another, a library and the package."""
+    """Modules outside the package that import each other, a library and the package."""
     root = package.parent
     for name, content in OUTSIDE.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -146,7 +146,7 @@ def outside(package, monkeypatch):
         ("package/other.py", False),
     ],
 )
-def test_a_class_of_somebody_else_is_followed_through_what_lies_beside_it(outside, origin, changed, matters):
+def test_digest_of_outside_class_covers_neighbouring_modules(outside, origin, changed, matters):
     digests = []
     for content in ("", "changed = 1\n"):
         with (outside / changed).open("a") as file:
@@ -161,7 +161,7 @@ def _reader():
     return importlib.import_module("mine.reader")
 
 
-def test_the_bases_of_a_class_count_wherever_they_are_imported(outside):
+def test_digest_covers_base_classes(outside):
     built = type("Built", (_reader().Reader,), {"__module__": __name__})
     found = {path.name for path in module._with_imports((built,), outside / "package")}
     assert {"reader.py", "my_base.py", "my_registry.py", "test_source_digest.py"} <= found
@@ -171,7 +171,7 @@ CELL = "SCALE = 2\nclass Drive:\n    def scan(self):\n        import my_helper\n
 
 
 def _notebook(source, kept=True):
-    """A class as a notebook has it: without a file, its source known to `linecache` alone."""
+    """A class of a notebook: without a file, its source is in `linecache` alone."""
     name = "/tmp/ipykernel_1/1.py"
     linecache.cache.pop(name, None)
     if kept:
@@ -185,26 +185,26 @@ def _notebook(source, kept=True):
     ("code", "same"),
     [(CELL + "# so\n", True), (CELL.replace("2", "3"), False), (CELL.replace("return", "return -"), False)],
 )
-def test_a_notebook_s_class_counts_by_its_cell(outside, code, same):
+def test_digest_of_notebook_class_depends_on_its_cell(outside, code, same):
     assert (source_digest(_notebook(CELL)) == source_digest(_notebook(code))) == same
 
 
-def test_what_a_notebook_s_cell_imports_counts(outside):
+def test_digest_of_notebook_class_covers_its_imports(outside):
     before = source_digest(_notebook(CELL))
     (outside / "beside" / "my_helper.py").write_text("changed = 1\n")
     assert source_digest(_notebook(CELL)) != before
 
 
-def test_code_that_nobody_can_see_is_never_the_same(outside):
+def test_digest_without_source_differs_between_processes(outside):
     hidden, partial, empty = _notebook(CELL, kept=False), _reader().partial, _notebook("class Drive: ...\n")
     for origin in (hidden, partial, empty):
         before = source_digest(origin)
-        assert source_digest(origin) == before  # within a process, it is
-        source_digest.cache_clear()  # as another one begins
+        assert source_digest(origin) == before  # the same within a process
+        source_digest.cache_clear()  # as in a new process
         assert source_digest(origin) != before
 
 
-def test_what_cannot_be_parsed_counts_by_its_bytes(package):
+def test_digest_of_unparsable_file_depends_on_its_bytes(package):
     path, digests = package / "other.py", []
     for content in (b"%magic a", b"%magic b", b"\x7fELF\0a", b"\x7fELF\0b"):
         path.write_bytes(content)

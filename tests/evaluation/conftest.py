@@ -11,7 +11,7 @@ from lidarlearn.geometry import se3
 
 
 class DriveWithoutScans(Sequence):
-    """Ground truth only: whatever reads a scan from it fails."""
+    """Ground truth alone: reading a scan fails."""
 
     def __init__(
         self,

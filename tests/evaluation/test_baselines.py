@@ -1,4 +1,4 @@
-"""Odometries by others behind our interface."""
+"""Odometries of other projects behind the interface of `BaseOdometry`."""
 
 import sys
 
@@ -18,11 +18,11 @@ BASELINES = tuple(PACKAGES)
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    return Drive(scenes.street(), poses=scenes.straight_path(9, 0.6), frames=9, sensor=hdl64(512))
+    return Drive(scenes.street(), poses=scenes.straight_path(9, 0.6), frames=9, sensor=hdl64(256))
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_it_follows_a_drive(name, drive):
+def test_baseline_follows_drive(name, drive):
     pytest.importorskip(name)
     odometry = build(name)
     frames = [odometry.register_scan(scan.points) for scan in drive]
@@ -34,7 +34,7 @@ def test_it_follows_a_drive(name, drive):
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_two_of_them_do_not_mix(name, drive):
+def test_baseline_instances_share_no_state(name, drive):
     pytest.importorskip(name)
     first = build(name)
     first.register_scan(drive.scan(0).points)
@@ -42,7 +42,7 @@ def test_two_of_them_do_not_mix(name, drive):
     assert torch.equal(build(name).register_scan(drive.scan(3).points).T_world_lidar, se3.identity())
 
 
-def test_kiss_icp_is_given_the_times_of_the_points(drive):
+def test_kiss_icp_uses_point_times(drive):
     pytest.importorskip("kiss_icp")
     with_times, without = build("kiss_icp"), build("kiss_icp")
     for index in range(4):
@@ -53,7 +53,7 @@ def test_kiss_icp_is_given_the_times_of_the_points(drive):
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_without_its_package_the_error_says_what_to_install(name, monkeypatch):
+def test_missing_package_error_names_pip_install(name, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(Exception, match=f"pip install {PACKAGES[name]}") as raised:
         build(name)

@@ -41,13 +41,13 @@ def methods(group):
     return [(row.method, row.sequence) for row in group.scores]
 
 
-def test_scores_come_back_to_the_last_digit(make_run, make_sequence, longer):
+def test_read_run_restores_scores_exactly(make_run, make_sequence, longer):
     drive = make_sequence("a", 300)
     expected = score("m", longer(drive.T_world_lidar, 0.01), drive, 10.0)
     assert read_run(make_run("r", "m", "a")).scores == [expected]
 
 
-def test_sequences_of_different_runs_make_one_row(make_run):
+def test_runs_on_different_sequences_share_a_row(make_run):
     (group,) = groups(make_run("1", "m", "a", settings={"k": 1}), make_run("2", "m", "b", settings={"k": 1}))
     assert methods(group) == [("m", "a"), ("m", "b")]
     _, (drift, _), _ = comparison([group])
@@ -55,28 +55,28 @@ def test_sequences_of_different_runs_make_one_row(make_run):
     assert drift.columns[1:3] == ("a", "b")
 
 
-def test_the_same_method_with_other_settings_says_which(make_run):
+def test_rows_name_differing_setting(make_run):
     first = make_run("1", "m", "a", settings={"odometry": {"local_map": {"size": 30}, "same": 1}})
     second = make_run("2", "m", "a", settings={"odometry": {"local_map": {"size": 20}, "same": 1}})
     (group,) = groups(first, second)
     assert [row.method for row in group.scores] == ["m [size=30]", "m [size=20]"]
 
 
-def test_settings_of_one_name_are_told_apart_by_the_whole_of_it(make_run):
+def test_ambiguous_setting_names_are_written_in_full(make_run):
     first = make_run("1", "m", "a", settings={"a": {"size": 1}, "b": {"size": 5}})
     second = make_run("2", "m", "a", settings={"a": {"size": 2}, "b": {"size": 6}})
     (group,) = groups(first, second)
     assert [row.method for row in group.scores] == ["m [a.size=1, b.size=5]", "m [a.size=2, b.size=6]"]
 
 
-def test_another_part_is_called_by_its_class_with_its_own_settings(make_run):
+def test_differing_part_is_named_by_class_and_its_settings(make_run):
     huber = {"weight": {"_target_": "lidarlearn.registration.weights.Huber", "delta_m": 0.2}}
     cauchy = {"weight": {"_target_": "lidarlearn.registration.weights.Cauchy", "sigma_m": 0.1}}
     (group,) = groups(make_run("1", "m", "a", settings=huber), make_run("2", "m", "a", settings=cauchy))
     assert [row.method for row in group.scores] == ["m [weight=Huber, delta_m=0.2]", "m [weight=Cauchy, sigma_m=0.1]"]
 
 
-def test_the_sensor_of_the_data_is_no_setting_of_the_method(make_run):
+def test_projection_of_data_is_no_setting_of_the_method(make_run):
     runs = [
         make_run(s, "m", s, settings={"sampling": {"projection": {"height": h}}}) for s, h in (("a", 64), ("b", 32))
     ]
@@ -84,12 +84,12 @@ def test_the_sensor_of_the_data_is_no_setting_of_the_method(make_run):
     assert methods(group) == [("m", "a"), ("m", "b")]
 
 
-def test_a_run_that_was_repeated_keeps_both_rows(make_run):
+def test_repeated_run_keeps_both_rows(make_run):
     (group,) = groups(make_run("1", "m", "a", settings={"k": 1}), make_run("2", "m", "a", settings={"k": 1}))
     assert methods(group) == [("m", "a"), ("m (2)", "a")]
 
 
-def test_runs_that_were_repeated_are_told_apart_by_as_much_of_their_paths_as_it_takes(make_run):
+def test_repeated_runs_are_labelled_by_distinct_part_of_path(make_run):
     runs = [make_run(f"{sweep}/0", "m", "a", settings={"k": 1}) for sweep in ("A", "B", "C")]
     (group,) = groups(*runs)
     assert methods(group) == [("m", "a"), ("m (B/0)", "a"), ("m (C/0)", "a")]
@@ -97,7 +97,7 @@ def test_runs_that_were_repeated_are_told_apart_by_as_much_of_their_paths_as_it_
     assert methods(group) == [("m", "a"), ("m", "b"), ("m (B/0)", "a"), ("m (C/0)", "a")]
 
 
-def test_trajectories_without_settings_differ_in_none(make_run):
+def test_run_without_settings_is_not_labelled_by_settings(make_run):
     own = [make_run(f"own_{k}", "m", "a", settings={"k": k, "same": 1}) for k in (1, 2)]
     (group,) = groups(*own, make_run("scored_again", "m", "a"))
     assert methods(group) == [("m [k=1]", "a"), ("m [k=2]", "a"), ("m", "a")]
@@ -105,7 +105,7 @@ def test_trajectories_without_settings_differ_in_none(make_run):
     assert methods(group) == [("m", "a"), ("m (scored_again)", "a")]
 
 
-def test_each_network_is_marked_where_it_was_trained_itself(make_run):
+def test_networks_are_marked_on_their_own_training_sequences(make_run):
     def run(digest, seen, evaluated):
         network = {"path": "best.ckpt", "sha256": digest, "trained_on": {"train_sequences": seen}}
         return make_run(
@@ -128,7 +128,7 @@ def test_each_network_is_marked_where_it_was_trained_itself(make_run):
         ({"ground_truth": {"a": "beef"}}, "not the same ground truth of sequence a"),
     ],
 )
-def test_what_was_measured_otherwise_is_kept_apart_and_says_why(make_run, change, words):
+def test_incomparable_runs_are_separated_with_reason(make_run, change, words):
     apart = groups(make_run("1", "m", "a"), make_run("2", "n", "a", **change), make_run("3", "o", "a"))
     assert [methods(group) for group in apart] == [[("m", "a"), ("o", "a")], [("n", "a")]]
     _, tables, closing = comparison(apart)
@@ -136,12 +136,12 @@ def test_what_was_measured_otherwise_is_kept_apart_and_says_why(make_run, change
     assert "Not comparable: 1 and 2" in closing and words in closing
 
 
-def test_results_of_earlier_versions_tell_nothing_of_the_ground_truth_and_stay_comparable(make_run):
+def test_results_without_ground_truth_digest_stay_comparable(make_run):
     (group,) = groups(make_run("1", "m", "a"), make_run("2", "n", "a", ground_truth={}))
     assert methods(group) == [("m", "a"), ("n", "a")]
 
 
-def test_an_experiments_table_spans_data_sets(make_run, tmp_path):
+def test_table_of_experiment_spans_data_sets(make_run, tmp_path):
     layout = TableLayout("both", {"towns": ["a"], "campus": ["b"]}, published={"m": [1.0, 2.0]})
     parts = groups(make_run("1", "m", "a", layout=layout), make_run("2", "m", "b", layout=layout, deskew=True))
     content, tables, closing = comparison(parts)
@@ -154,7 +154,7 @@ def test_an_experiments_table_spans_data_sets(make_run, tmp_path):
     assert "both" in (tmp_path / "joint" / "results.md").read_text()
 
 
-def test_what_was_measured_twice_is_not_averaged_in_an_experiments_table(make_run):
+def test_table_of_experiment_does_not_average_repeated_results(make_run):
     layout = TableLayout("both", {"towns": ["a", "b"]})
     runs = [make_run(str(share), "m", "a", share, layout=layout, max_frames=int(1e4 * share)) for share in (0.01, 0.02)]
     _, tables, _ = comparison(groups(*runs))
@@ -165,7 +165,7 @@ def test_what_was_measured_twice_is_not_averaged_in_an_experiments_table(make_ru
     assert [one, two] == [(("m", f"{error:.3f} (1 of 2)"),) for error in errors]
 
 
-def test_a_folder_without_results_is_named(tmp_path):
+def test_read_run_names_folder_without_results(tmp_path):
     with pytest.raises(UserError, match=r"results\.json: no such file"):
         read_run(tmp_path)
     (tmp_path / "results.json").write_text("{}")

@@ -19,7 +19,7 @@ def basin(drive):
     return convergence_basin(Backend(GridSampling(), LocalMap(KdTree())), drive, PROBE)
 
 
-def test_a_registration_succeeds_where_the_one_from_the_truth_ends_however_good_the_truth_is():
+def test_basin_is_relative_to_registration_from_ground_truth():
     exact, rough = BoxSequence("0", 6), BoxSequence("0", 6)
     rough.T_world_lidar = rough.T_world_lidar.clone()
     rough.T_world_lidar[4, 1, 3] += 0.3
@@ -33,14 +33,14 @@ def test_a_registration_succeeds_where_the_one_from_the_truth_ends_however_good_
 
 
 class Stay(GaussNewton):
-    """Ends where it starts, and keeps what it was given."""
+    """Returns the initial poses, and records its arguments."""
 
     def register(self, points, association, T_initial, search_distance_m, normals):
         self.points, self.T_initial = points, T_initial
         return SimpleNamespace(T_world_lidar=T_initial)
 
 
-def test_initial_poses_lie_about_the_true_one_and_a_turned_end_is_no_success():
+def test_basin_probes_offsets_and_angles_about_true_pose():
     drive, stay = BoxSequence("0", 6), Stay()
     probe = Probe(offsets_m=(1.0,), angles_deg=(10.0,), directions=2, every=4, min_range_m=3.0, max_range_m=8.0)
     measured = convergence_basin(Backend(GridSampling(), LocalMap(KdTree()), stay), drive, probe)
@@ -51,7 +51,7 @@ def test_initial_poses_lie_about_the_true_one_and_a_turned_end_is_no_success():
     assert measured.by_offset_m == {1.0: 0.0} and measured.by_angle_deg == {10.0: 0.0}
 
 
-def test_where_the_one_from_the_truth_ends_is_printed():
+def test_basin_tables_show_error_of_registration_from_truth():
     rows = [table.rows for table in basin_tables({"kd_f2m": basin(BoxSequence("0", 6))})]
     assert rows[0] == (("kd_f2m", "100", "0"),)
     ((name, metres, degrees),) = rows[-1]

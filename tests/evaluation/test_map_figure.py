@@ -11,7 +11,7 @@ def picture(points, T, T_true=None, pixel_m=0.5, name="m"):
     return figure, axes, axes.images[0]
 
 
-def test_heights_are_shown_where_they_are(make_drive):
+def test_map_figure_places_heights(make_drive):
     points = torch.tensor([[0.1, 0.1, 1.0], [0.2, 0.2, 7.0], [9.9, 4.9, 2.0]])
     figure, axes, image = picture(points, make_drive(5), make_drive(5))
     heights = np.ma.filled(image.get_array(), np.nan)
@@ -22,21 +22,21 @@ def test_heights_are_shown_where_they_are(make_drive):
     assert axes.lines[1].get_linestyle() == "--" and "[m]" in figure.axes[1].get_ylabel()
 
 
-@pytest.mark.parametrize("name", ["测试 数据", "a$b_{c$d"])
-def test_names_of_any_kind(make_drive, name, tmp_path):
+@pytest.mark.parametrize("name", ["测试 数据", "a$b_{c$d"], ids=["cjk", "math"])
+def test_map_figure_accepts_any_name(make_drive, name):
     figure, _, _ = picture(torch.ones(1, 3), make_drive(5), name=name)
-    figure.savefig(tmp_path / "a.png")
+    figure.draw_without_rendering()
 
 
-def test_a_large_map_takes_no_larger_picture(make_drive):
+def test_map_figure_limits_image_size(make_drive):
     corners = torch.tensor([[0.0, 0, 0], [5000, 3000, 1]])
     _, _, image = picture(corners, make_drive(5), pixel_m=0.2)
     assert max(image.get_array().shape) <= 1301
 
 
-@pytest.mark.parametrize("points", [torch.ones(1, 3), torch.tensor([[0.0, 0, 0], [0, 3000, 1]])])
-def test_narrow_maps_get_room_around_them(make_drive, points, tmp_path):
+@pytest.mark.parametrize("points", [torch.ones(1, 3), torch.tensor([[0.0, 0, 0], [0, 3000, 1]])], ids=["point", "line"])
+def test_map_figure_widens_narrow_maps(make_drive, points):
     figure, axes, _ = picture(points, make_drive(5))
     width, height = (upper - lower for lower, upper in (axes.get_xlim(), axes.get_ylim()))
     assert 0.4 < width / height <= 1
-    figure.savefig(tmp_path / "a.png")
+    figure.draw_without_rendering()

@@ -1,4 +1,4 @@
-"""Maps of drives through closed-form worlds: where their surfaces are, what they keep, how sharp they come out."""
+"""Maps of drives through closed-form worlds: positions of surfaces, contents, sharpness."""
 
 from functools import cache
 
@@ -34,7 +34,7 @@ def to_surface(points):
 
 
 class Standing(DriveWithoutScans):
-    """Sees the same in every scan."""
+    """A sensor that does not move; its scans repeat."""
 
     def __init__(self, frames: int, *scans: Scan):
         super().__init__("standing", se3.identity(frames), frames)
@@ -48,7 +48,7 @@ def standing_map(sequence, **settings):
     return build_map(sequence, sequence.T_world_lidar, MapSettings(**settings))
 
 
-def test_walls_are_where_they_are():
+def test_map_places_walls_and_floor():
     drive, advanced = corridor(), []
     built = build_map(drive, drive.T_world_lidar, MapSettings(max_range_m=30.0), True, lambda: advanced.append(1))
     assert len(built.points) > 5000 and len(advanced) == FRAMES
@@ -56,7 +56,7 @@ def test_walls_are_where_they_are():
     assert built.extent_m[1] == pytest.approx(8, abs=0.2)
 
 
-def test_the_motion_within_a_scan_is_compensated_where_the_run_did():
+def test_map_deskews_if_requested():
     drive = corridor()
     deskewed, skewed = (
         build_map(drive, drive.T_world_lidar, MapSettings(max_range_m=30.0), on) for on in (True, False)
@@ -64,40 +64,40 @@ def test_the_motion_within_a_scan_is_compensated_where_the_run_did():
     assert to_surface(skewed.points).mean() > 3 * to_surface(deskewed.points).mean()
 
 
-def test_a_voxel_has_one_point():
+def test_map_has_one_point_per_voxel():
     drive = corridor()
     built = build_map(drive, drive.T_world_lidar, MapSettings(voxel_size_m=0.5, max_range_m=30.0))
     cells = voxel_cells(built.points.double(), 0.5)
     assert len(cells.unique(dim=0)) == len(cells) > 500
 
 
-def test_the_point_is_the_mean_with_the_mean_intensity():
+def test_voxel_point_is_mean_position_and_intensity():
     points = torch.tensor([[5.1, 0.1, 0.3], [5.3, 0.3, 0.1], [-7.2, 0.2, 0.2]])
     built = standing_map(Standing(1, Scan(points, None, torch.tensor([0.2, 0.6, 0.9]))), voxel_size_m=0.5)
     torch.testing.assert_close(built.points, torch.tensor([[-7.2, 0.2, 0.2], [5.2, 0.2, 0.2]]))
     torch.testing.assert_close(built.intensities, torch.tensor([0.9, 0.4]))
 
 
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_intensities_that_some_scans_lack_are_left_out(order):
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["first", "last"])
+def test_map_drops_intensities_that_some_scans_lack(order):
     points = torch.full((4, 3), 5.0)
     scans = (Scan(points, None, torch.ones(4)), Scan(points))
     assert standing_map(Standing(2, *(scans[i] for i in order))).intensities is None
 
 
-def test_what_is_seen_again_takes_no_more_room():
+def test_repeated_scans_do_not_grow_the_map():
     scan = corridor().scan(0)
     once, often = (standing_map(Standing(frames, scan)) for frames in (1, 20))
     torch.testing.assert_close(once.points, often.points)
 
 
-def test_only_points_in_range_and_scans_in_turn_are_used():
+def test_map_uses_points_in_range_of_every_nth_scan():
     near, far = (Scan(torch.tensor([[x, 0.0, 0.0], [1.0, 0, 0], [90.0, 0, 0]])) for x in (5.0, 9.0))
     torch.testing.assert_close(standing_map(Standing(4, near, far), every=2).points, torch.tensor([[5.0, 0, 0]]))
     assert len(standing_map(Standing(4, near, far), min_range_m=0.0, max_range_m=100.0).points) == 4
 
 
-def test_scans_without_a_point_in_range_and_poses_of_another_drive_are_refused():
+def test_map_refuses_empty_scans_and_wrong_number_of_poses():
     sequence = Standing(3, Scan(torch.ones(5, 3)))
     with pytest.raises(UserError, match="no point between"):
         standing_map(sequence)
@@ -110,13 +110,13 @@ def test_scans_without_a_point_in_range_and_poses_of_another_drive_are_refused()
     [({"voxel_size_m": 0.0}, "--voxel"), ({"voxel_size_m": float("nan")}, "--voxel"), ({"every": 0}, "--every"),
      ({"min_range_m": 70.0}, "--min-range"), ({"max_range_m": 1.0}, "--max-range")],
 )  # fmt: skip
-def test_settings_that_leave_nothing_are_refused(setting, remedy):
+def test_map_settings_refuse_invalid_values(setting, remedy):
     with pytest.raises(UserError, match=remedy):
         MapSettings(**setting)
 
 
-@pytest.mark.parametrize("intensities", [None, torch.tensor([0.25, 0.75])])
-def test_other_programs_read_the_file(tmp_path, intensities):
+@pytest.mark.parametrize("intensities", [None, torch.tensor([0.25, 0.75])], ids=["xyz", "intensity"])
+def test_ply_file_is_read_by_meshio_and_open3d(tmp_path, intensities):
     points = torch.tensor([[-7.25, 1.5, 0.125], [5.0, 0.25, 2.5]])
     path = tmp_path / "new" / "a.ply"
     standing_map(Standing(1, Scan(points, None, intensities))).write(path)
@@ -130,7 +130,7 @@ def test_other_programs_read_the_file(tmp_path, intensities):
         assert cloud.intensities.tolist() == by_open3d.intensity.numpy()[:, 0].tolist() == intensities.tolist()
 
 
-def test_the_variance_of_a_noisy_plane_is_that_of_its_noise():
+def test_mean_plane_variance_is_noise_variance():
     generator, sigma = torch.Generator().manual_seed(0), 0.02
     sums = []
     for normal in torch.randn(50, 3, generator=generator, dtype=torch.float64):
@@ -142,9 +142,9 @@ def test_the_variance_of_a_noisy_plane_is_that_of_its_noise():
     assert mean_plane_variance(moments(torch.rand(9, 3)).sum(0)[None]) is None
 
 
-def test_the_worse_the_poses_the_thicker_the_surfaces():
-    drive = Drive(scenes.street(), poses=scenes.straight_path(12, 0.9), frames=12, sensor=hdl64(256))
-    noise = torch.randn(12, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+def test_mean_plane_variance_grows_with_pose_errors():
+    drive = Drive(scenes.street(), poses=scenes.straight_path(8, 0.9), frames=8, sensor=hdl64(256))
+    noise = torch.randn(8, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     noise[:, 3:] /= 20
     variances = [
         build_map(drive, drive.T_world_lidar @ se3.exp(scale * noise), MapSettings()).mean_plane_variance_m2

@@ -16,38 +16,38 @@ def parsed(name: str, *networks: str) -> Method:
 
 @pytest.mark.parametrize("initialization", INITIALIZATIONS)
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_every_combination_of_the_paper_is_configured_and_its_name_says_the_parts(initialization, backend):
+def test_every_method_of_the_paper_is_configured(initialization, backend):
     method = configured_method(composed(), f"{initialization}+{backend}")
     assert method == Method(initialization, backend)
     assert str(method) == f"{initialization}+{backend}"
 
 
 @pytest.mark.parametrize("name", [*INITIALIZATIONS, *BASELINES])
-def test_an_initialization_or_a_baseline_can_stand_alone(name):
+def test_initialization_or_baseline_alone_is_a_method(name):
     method = configured_method(composed(), name)
     assert method == Method(name, None) and str(method) == name
 
 
-def test_the_papers_capitals_are_understood():
+def test_method_names_ignore_case():
     assert parsed("CV+Kd_F2M") == Method("cv", "kd_f2m")
 
 
 @pytest.mark.parametrize(
     "name", ["", "icp", "cv+", "cv+icp_f2m", "kd_f2m", "cv+kd", "+kd_f2m", "cv kd_f2m", "cv+kd_f2m+", "kiss_icp+kd_f2m"]
 )
-def test_other_names_are_refused_with_the_ones_there_are(name):
+def test_unknown_method_error_lists_valid_names(name):
     with pytest.raises(UserError, match=r"no method '.*'\.\n  change: .*cv\+kd_f2m") as error:
         parsed(name)
     assert all(part in str(error.value) for part in (*INITIALIZATIONS, *BACKENDS, *BASELINES))
 
 
 @pytest.mark.parametrize("name", ["PoseNet_ICP+kd_f2m", "posenet_icp+kd_f2m"])
-def test_networks_are_initializations_by_their_own_names_in_any_case(name):
+def test_networks_are_initializations_ignoring_case(name):
     assert parsed(name, "PoseNet_ICP") == Method("PoseNet_ICP", "kd_f2m")
     with pytest.raises(UserError, match="PoseNet_ICP"):
         parsed("posenet_cpi", "PoseNet_ICP")
 
 
-def test_a_backend_of_ones_own_needs_nothing_but_its_config():
+def test_custom_backend_is_configured_by_name():
     config = composed("+odometry@odometry.mine=kd_f2m")
     assert configured_method(config, "cv+mine") == Method("cv", "mine")

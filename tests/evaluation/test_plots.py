@@ -18,7 +18,7 @@ def legend(figure):
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def test_trajectories_start_together_to_the_same_scale(make_drive, longer):
+def test_trajectory_figure_aligns_starts_and_scales_equally(make_drive, longer):
     truth = make_drive(80)
     elsewhere = se3.exp(torch.tensor([50.0, 7, 1, 0.1, 0.2, 2.0], dtype=torch.float64)) @ truth
     figure = trajectory_figure("a", truth, {"same": elsewhere, "longer": longer(truth, 0.1)})
@@ -33,26 +33,26 @@ def test_trajectories_start_together_to_the_same_scale(make_drive, longer):
     assert far[-1, 0] > true[-1, 0]
 
 
-def test_a_runaway_does_not_hide_the_rest(make_drive, longer):
+def test_trajectory_figure_clips_diverged_trajectory(make_drive, longer):
     truth = make_drive(60)
     (axes,) = trajectory_figure("a", truth, {"runaway": longer(truth, 1000.0)}).axes
     assert axes.get_xlim()[1] < 3 * float(truth[:, 0, 3].max())
 
 
-@pytest.mark.parametrize("scale", [(1.0, 0.02), (1.0, 1.0), (0.02, 1.0)], ids=["ahead", "both ways", "aside"])
-def test_labels_of_a_drive_of_any_shape_are_on_the_picture(tmp_path, scale):
+@pytest.mark.parametrize("scale", [(1.0, 0.02), (1.0, 1.0), (0.02, 1.0)], ids=["along_x", "square", "along_y"])
+def test_trajectory_figure_contains_labels_and_legend(scale):
     angle = torch.linspace(0, 6.28, 200, dtype=torch.float64)
     T_world = se3.identity(200)
     T_world[:, :2, 3] = 200 * torch.stack([angle.sin(), angle.cos()], dim=1) * torch.tensor(scale)
     figure = trajectory_figure("a", T_world, {"posenet_icp+p_f2m": T_world})
-    figure.savefig(tmp_path / "a.png")
+    figure.draw_without_rendering()
     (axes,) = figure.axes
     for label in (axes.xaxis.label, axes.yaxis.label, figure.legends[0]):
         box = label.get_window_extent()
         assert min(box.x0, box.y0) >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height
 
 
-def test_the_legend_of_all_methods_is_on_the_picture(make_drive):
+def test_trajectory_figure_contains_legend_of_24_methods(make_drive):
     T = make_drive(50)
     figure = trajectory_figure("a", T, {f"posenet+method_{i}": T for i in range(24)})
     box = figure.legends[0].get_window_extent()
@@ -60,7 +60,7 @@ def test_the_legend_of_all_methods_is_on_the_picture(make_drive):
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_trajectories_of_hardly_any_pose(make_drive, frames):
+def test_trajectory_figure_of_one_or_two_poses(make_drive, frames):
     T = make_drive(frames)
     figure = trajectory_figure("a", None, {"m": T})
     (axes,) = figure.axes
@@ -68,7 +68,7 @@ def test_trajectories_of_hardly_any_pose(make_drive, frames):
     assert axes.get_xlim()[0] < axes.get_xlim()[1]
 
 
-def test_drift_over_length():
+def test_drift_figure_plots_errors_over_length():
     averages = {"m": {100: SegmentAverage(3, 1.5, 0.4), 200: SegmentAverage(1, 1.0, 0.3)}}
     left, right = drift_figure("a", averages).axes
     assert left.lines[0].get_xydata().tolist() == [[100, 1.5], [200, 1.0]]
@@ -76,17 +76,17 @@ def test_drift_over_length():
     assert (left.get_ylabel(), right.get_ylabel()) == ("translation error [%]", "rotation error [deg/100 m]")
 
 
-def test_speed_distribution_sums_to_all_scans():
+def test_speed_figure_sums_to_100_percent_with_outlier():
     true = torch.linspace(0, 50, 200, dtype=torch.float64)
     outlier = torch.cat([true, torch.tensor([900.0], dtype=torch.float64)])
     (axes,) = speed_figure("a", true, {"m": outlier}).axes
     assert sum(bar.get_height() for bar in axes.patches if hasattr(bar, "get_height")) == pytest.approx(100)
-    assert axes.get_xlim()[1] < 100  # one mistake does not squeeze the picture
+    assert axes.get_xlim()[1] < 100  # in spite of the outlier
     assert "the last bin holds all beyond" in axes.get_xlabel()
     assert "km/h" in axes.get_ylabel()
 
 
-def test_frame_errors_mark_failures(make_drive, longer):
+def test_frame_error_figure_marks_failure_limits(make_drive, longer):
     truth = make_drive(40)
     upper, lower = frame_error_figure("a", truth, {"m": longer(truth, 0.1)}).axes
     assert upper.get_yscale() == lower.get_yscale() == "log"
@@ -95,14 +95,14 @@ def test_frame_errors_mark_failures(make_drive, longer):
     assert lower.get_xlabel() == "scan"
 
 
-def test_frame_errors_that_are_none_or_rounded_lie_at_the_bottom(make_drive):
+def test_frame_error_figure_clamps_tiny_errors(make_drive):
     truth = make_drive(40)
     turned = se3.exp(torch.tensor([0, 0, 0, 0.1, 0.2, 0.3], dtype=torch.float64)) @ truth
     for axes in frame_error_figure("a", truth, {"same": truth, "turned": turned}).axes:
         assert all(line.get_ydata().tolist() == [1e-6] * 39 for line in axes.lines[:2])
 
 
-def test_methods_look_different_and_keep_their_look(make_drive):
+def test_methods_have_distinct_styles_in_all_figures(make_drive):
     T = make_drive(20)
     methods = {f"m{i}": T for i in range(12)}
     (axes,) = trajectory_figure("a", None, methods).axes
@@ -112,7 +112,7 @@ def test_methods_look_different_and_keep_their_look(make_drive):
     assert [(line.get_color(), line.get_linestyle()) for line in errors.lines[:12]] == looks
 
 
-def test_all_figures_of_an_evaluation_can_be_written(tmp_path, make_sequence, longer, unknown_drive):
+def test_figures_of_evaluation_are_written_as_png(tmp_path, make_sequence, longer, unknown_drive):
     sequences = {"a": make_sequence("a", 150), "unknown": unknown_drive}
     estimates = {"m": {"a": longer(sequences["a"].T_world_lidar, 0.02), "unknown": se3.identity(5)}}
     scores = [score("m", T, sequences[name]) for name, T in estimates["m"].items()]
@@ -129,38 +129,38 @@ def test_all_figures_of_an_evaluation_can_be_written(tmp_path, make_sequence, lo
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("name", ["测试 数据", "a$b_{c$d"])
-def test_names_of_any_kind(tmp_path, make_sequence, name):
-    """A letter without a font is no warning, which fails a test, and a formula none that stops an evaluation."""
+@pytest.mark.parametrize("name", ["测试 数据", "a$b_{c$d"], ids=["cjk", "math"])
+def test_figures_accept_any_name(make_sequence, name):
+    """Letters without a font do not warn, and formulas are not parsed."""
     sequence = make_sequence(name, 150)
     estimates = {name: {name: sequence.T_world_lidar}}
     scores = [score(name, sequence.T_world_lidar, sequence)]
     drawn = dict(figures({name: sequence}, estimates, scores))
     assert len(drawn) == 4
-    for figure_name, figure in drawn.items():
-        figure.savefig(tmp_path / f"{figure_name}.png")
+    for figure in drawn.values():
+        figure.draw_without_rendering()
         assert name in figure.axes[0].get_title(loc="left") and name in legend(figure)
     errors = drawn[f"frame_errors_{name}"].axes[0].yaxis.get_ticklabels()
-    assert all(label.get_parse_math() for label in errors)  # 10 to the power of something
+    assert all(label.get_parse_math() for label in errors)  # powers of ten
 
 
-def test_letters_are_looked_for_in_fonts_of_east_asia(monkeypatch, make_drive):
+def test_figures_add_installed_east_asian_fonts(monkeypatch, make_drive):
     monkeypatch.setattr(figure_module, "_EAST_ASIAN", ("of another system", "DejaVu Serif"))
     figure = trajectory_figure("a", None, {"m": make_drive(5)})
     assert figure.axes[0].title.get_fontfamily() == ["sans-serif", "DejaVu Serif"]
 
 
-def test_what_cannot_be_drawn_is_left_out(unknown_drive):
+def test_figures_without_ground_truth_show_trajectories_alone(unknown_drive):
     drawn = dict(figures({"unknown": unknown_drive}, {"m": {"unknown": se3.identity(5)}}, []))
     assert list(drawn) == ["trajectories_unknown"]
 
 
-def test_an_error_on_the_way_leaves_the_figures_of_what_was_finished(unknown_drive):
+def test_figures_skip_sequences_without_estimates(unknown_drive):
     drawn = dict(figures({"first": unknown_drive, "second": unknown_drive}, {"m": {"first": se3.identity(5)}}, []))
     assert list(drawn) == ["trajectories_first"]
 
 
-def test_groups_of_sequences_get_distributions_of_their_own(make_sequence, longer):
+def test_figures_have_speed_distribution_per_group(make_sequence, longer):
     sequences = {"slow": make_sequence("slow", 50), "fast": make_sequence("fast", 50)}
     sequences["fast"].T_world_lidar = longer(sequences["fast"].T_world_lidar, 2.0)
     estimates = {"m": {name: s.T_world_lidar for name, s in sequences.items()}}

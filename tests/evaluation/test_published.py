@@ -24,28 +24,28 @@ def rows(**frames):
         ("CV + P-F2M, Dellenbach 2021", 0.678),
     ],
 )
-def test_rows_have_the_mean_that_is_published_with_them(method, mean):
-    """A slip in copying a row would move its mean."""
+def test_published_rows_have_their_published_mean(method, mean):
+    """A typing error in a row changes its mean."""
     (row,) = [row for row in KITTI if row.method == method]
     digits = 3 if round(mean, 2) != mean else 2
     assert row.sequence_mean_percent(list(KITTI_FRAMES)) == pytest.approx(mean, abs=0.6 * 10**-digits)
 
 
-def test_the_mean_over_a_choice_of_sequences():
+def test_sequence_mean_needs_all_requested_sequences():
     (delora,) = [row for row in KITTI if row.method.startswith("DeLORA")]
     assert delora.sequence_mean_percent(["09", "10"]) == pytest.approx((6.05 + 6.44) / 2)
     assert delora.sequence_mean_percent(["08", "09"]) is None
     assert delora.sequence_mean_percent([]) is None
 
 
-def test_only_whole_sequences_of_kitti_count():
+def test_whole_kitti_sequences_excludes_partial_ones():
     scores = rows(s04=51, s09=1591, s10=1201, s11=921)
     assert whole_kitti_sequences("kitti_00-08", scores) == ["09", "10"]
     assert whole_kitti_sequences("kitti_raw", scores) == []
     assert whole_kitti_sequences("simulated_urban", scores) == []
 
 
-def test_rows_without_a_figure_for_these_sequences_are_left_out():
+def test_published_beside_omits_rows_without_these_sequences():
     on_09 = {row.method for row in published_beside(["09"])}
     on_00 = {row.method for row in published_beside(["00"])}
     assert on_09 - on_00 == {"DeLORA 00-08, unsupervised", "RSLO 00-06, unsupervised"}

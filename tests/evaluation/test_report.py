@@ -40,7 +40,7 @@ def cells(table, label):
     return dict(zip(table.columns, row, strict=True))
 
 
-def test_results_json_has_the_promised_fields(tmp_path, scores):
+def test_results_json_has_documented_fields(tmp_path, scores):
     write_report(tmp_path / "run", PROTOCOL, scores)
     report = json.loads((tmp_path / "run" / "results.json").read_text())
     assert list(report) == ["protocol", "results", "averages"]
@@ -77,12 +77,12 @@ def test_undefined_figures_are_null(tmp_path, scores, unknown_drive):
     assert bad["frames_per_second"] is None
 
 
-def test_a_protocol_that_json_cannot_hold_is_refused(tmp_path, scores):
+def test_protocol_that_is_not_json_is_refused(tmp_path, scores):
     with pytest.raises(TypeError, match="not JSON serializable"):
         write_report(tmp_path, {"data": object()}, scores)
 
 
-def test_drift_table(scores):
+def test_drift_table_marks_training_sequences_and_short_drives(scores):
     table = drift_table("simulated_urban", scores, seen={("posenet", "a")})
     assert table.columns == ("method", "a", "short", "mean of sequences", "mean of segments")
     row = cells(table, "posenet")
@@ -98,7 +98,7 @@ def test_drift_table(scores):
     assert "published" not in notes
 
 
-def test_what_a_network_was_trained_on_counts_for_every_method_with_it():
+def test_seen_in_training_covers_all_methods_of_a_network():
     def network(sequence):
         return {"trained_on": {"train_sequences": [sequence]}}
 
@@ -109,26 +109,26 @@ def test_what_a_network_was_trained_on_counts_for_every_method_with_it():
     assert seen_in_training({"checkpoint": None}, rows) == set()
 
 
-def test_a_sequence_without_ground_truth_leaves_a_dash_and_says_so(scores):
+def test_drift_table_shows_dash_without_ground_truth(scores):
     table = drift_table("folder", [*scores, Score("posenet", "unknown", 5)])
     assert cells(table, "posenet")["unknown"] == "-"
     assert any("no ground truth" in note for note in table.notes)
 
 
-def test_without_any_ground_truth_one_table_says_what_is_known():
+def test_report_without_any_ground_truth_has_one_table():
     (table,) = report_tables("folder", [Score("m", "a", 5, frames_per_second=9.0, health={"flagged": 1})])
     assert table.columns == ("method", "sequence", "scans", "flagged", "scans/s")
     assert table.rows == (("m", "a", "5", "1", "9.0"),)
     assert "no ground truth" in table.title
 
 
-def test_one_sequence_has_no_means(scores):
+def test_drift_table_of_one_sequence_has_no_means(scores):
     table = drift_table("simulated_urban", [row for row in scores if row.sequence == "a"])
     assert table.columns == ("method", "a") and {len(row) for row in table.rows} == {2}
     assert not any("averages" in note for note in table.notes)
 
 
-def test_averages_over_fewer_sequences_say_so():
+def test_drift_table_marks_partial_means():
     def row(method, sequence):
         return Score(method, sequence, 300, 299.0, 5, 1.0, 0.1)
 
@@ -138,7 +138,7 @@ def test_averages_over_fewer_sequences_say_so():
     assert cells(table, "whole")["mean of sequences"] == "1.000"
 
 
-def test_published_rows_beside_whole_kitti_sequences():
+def test_drift_table_shows_published_rows_for_whole_kitti():
     rows = [Score("m", "09", 1591, 1705.0, 958, 0.5, 0.2), Score("m", "04", 51, 69.0, 0)]
     table = drift_table("kitti_00-08", rows)
     kiss = cells(table, "KISS-ICP (published)")
@@ -151,12 +151,12 @@ def test_published_rows_beside_whole_kitti_sequences():
     assert drift_table("nclt", rows).reference == ()
 
 
-def test_published_averages_are_over_the_same_sequences_or_not_shown():
+def test_drift_table_hides_published_means_of_other_sequences():
     partly = [Score("m", "09", 1591, 1705.0, 958, 0.5, 0.2), Score("m", "08", 1000, 900.0, 400, 0.5, 0.2)]
     assert cells(drift_table("kitti_00-08", partly), "KISS-ICP (published)")["mean of sequences"] == "-"
 
 
-def test_details_table_has_units_and_a_row_for_each_result(scores):
+def test_details_table_has_a_row_per_result_with_units(scores):
     table = details_table([*scores, Score("any", "unknown", 5)])
     assert [row[:2] for row in table.rows] == [*((row.method, row.sequence) for row in scores), ("any", "unknown")]
     first = dict(zip(table.columns, table.rows[0], strict=True))
@@ -168,7 +168,7 @@ def test_details_table_has_units_and_a_row_for_each_result(scores):
     assert table.rows[-1][2:] == ("5", *("-",) * 9)
 
 
-def test_results_md_and_the_terminal_show_the_same_tables(tmp_path, scores):
+def test_results_md_and_terminal_show_same_tables(tmp_path, scores):
     write_report(tmp_path, PROTOCOL, scores)
     text = (tmp_path / "results.md").read_text()
     assert drift_table("simulated_urban", scores).markdown() in text
@@ -181,7 +181,7 @@ def test_results_md_and_the_terminal_show_the_same_tables(tmp_path, scores):
         assert all(cell in printed for cell in row)
 
 
-def test_output_that_goes_to_a_file_is_not_squeezed(scores, capsys):
+def test_tables_printed_to_file_are_not_wrapped(scores, capsys):
     print_tables(report_tables("simulated_urban", scores))
     lines = capsys.readouterr().out.splitlines()
     assert sum("cv+p_f2m" in line for line in lines) == 3  # one line a row: the first table and two sequences

@@ -1,4 +1,4 @@
-"""What a run leaves behind: trajectories, health records and a summary, from which alone everything is scored."""
+"""The files of a run: trajectories, health records and a summary."""
 
 import csv
 import json
@@ -27,7 +27,7 @@ class Numbered(DriveWithoutScans):
 
 
 class OneMetreAScan(BaseOdometry):
-    """Says it moved by a metre, and remembers what it was fed with."""
+    """Moves by a metre with each scan, and records its input."""
 
     def __init__(self) -> None:
         self.fed: list[tuple[int, bool]] = []
@@ -46,14 +46,14 @@ def sequence(make_drive, T_camera_lidar) -> Numbered:
 
 
 @pytest.mark.parametrize("deskew", [False, True])
-def test_every_scan_is_fed_in_order_and_times_only_where_asked_for(sequence, tmp_path, deskew):
+def test_run_registers_scans_in_order_with_times_if_deskewing(sequence, tmp_path, deskew):
     odometry, advanced = OneMetreAScan(), []
     run_odometry(odometry, sequence, Export(tmp_path, "04"), deskew, lambda: advanced.append(1))
     assert odometry.fed == [(i + 1, deskew) for i in range(6)]
     assert len(advanced) == 6
 
 
-def test_poses_come_back_as_they_were(sequence, tmp_path):
+def test_export_restores_poses(sequence, tmp_path):
     export = Export(tmp_path, "04")
     run_odometry(OneMetreAScan(), sequence, export)
     poses, summary = read_export(export, sequence)
@@ -64,8 +64,8 @@ def test_poses_come_back_as_they_were(sequence, tmp_path):
     assert summary["health"]["flagged"] == 0
 
 
-def test_files_are_in_the_frame_of_the_data_set(sequence, tmp_path):
-    """KITTI's camera looks along z: driving forward is motion along its third axis."""
+def test_exported_poses_are_in_reference_frame(sequence, tmp_path):
+    """KITTI's camera looks along z."""
     export = Export(tmp_path, "04")
     run_odometry(OneMetreAScan(), sequence, export)
     rows = [[float(x) for x in line.split()] for line in export.kitti.read_text().splitlines()]
@@ -76,14 +76,14 @@ def test_files_are_in_the_frame_of_the_data_set(sequence, tmp_path):
     assert stamps == pytest.approx([0.1 * i for i in range(6)])
 
 
-def test_a_row_of_health_for_every_scan(sequence, tmp_path):
+def test_health_file_has_a_row_per_scan(sequence, tmp_path):
     export = Export(tmp_path, "04")
     run_odometry(OneMetreAScan(), sequence, export)
     with export.health.open(newline="") as file:
         assert [int(row["points"]) for row in csv.DictReader(file)] == [1, 2, 3, 4, 5, 6]
 
 
-def test_what_came_before_a_damaged_scan_is_exported_as_partial(sequence, tmp_path):
+def test_poses_before_damaged_scan_are_exported_as_partial(sequence, tmp_path):
     sequence.damaged = 3
     export = Export(tmp_path, "04")
     with pytest.raises(UserError, match="scan 3 is damaged"):
@@ -93,7 +93,7 @@ def test_what_came_before_a_damaged_scan_is_exported_as_partial(sequence, tmp_pa
     assert json.loads((tmp_path / "04.partial.json").read_text())["frames_per_second"] > 0
 
 
-def test_nothing_of_an_earlier_run_stays(sequence, tmp_path):
+def test_run_replaces_files_of_earlier_run(sequence, tmp_path):
     export = Export(tmp_path, "04")
     run_odometry(OneMetreAScan(), sequence, export)
     sequence.damaged = 3
@@ -105,7 +105,7 @@ def test_nothing_of_an_earlier_run_stays(sequence, tmp_path):
     assert not list(tmp_path.glob("*.partial.*"))
 
 
-def test_an_interrupted_run_leaves_what_it_has(sequence, tmp_path):
+def test_interrupted_run_exports_partial_poses(sequence, tmp_path):
     def interrupt() -> None:
         raise KeyboardInterrupt
 
@@ -114,21 +114,21 @@ def test_an_interrupted_run_leaves_what_it_has(sequence, tmp_path):
     assert len((tmp_path / "04.partial.txt").read_text().splitlines()) == 1
 
 
-def test_a_damaged_first_scan_leaves_nothing(sequence, tmp_path):
+def test_damaged_first_scan_exports_nothing(sequence, tmp_path):
     sequence.damaged = 0
     with pytest.raises(UserError):
         run_odometry(OneMetreAScan(), sequence, Export(tmp_path, "04"))
     assert not list(tmp_path.iterdir())
 
 
-def test_sequences_without_time_stamps_and_without_truth_are_exported(tmp_path):
+def test_sequence_without_times_and_truth_is_exported(tmp_path):
     sequence = Numbered("x", None, 3)
     run_odometry(OneMetreAScan(), sequence, Export(tmp_path, "x"))
     poses, _ = read_export(Export(tmp_path, "x"), sequence)
     assert poses[:, 0, 3].tolist() == [0, 1, 2]
 
 
-def test_the_summary_counts_what_was_flagged_and_means_are_over_what_was_registered():
+def test_summary_counts_flags_and_averages_registered_frames():
     records = [
         Health(0),
         Health(1, iterations=4, rmse_m=0.02, inlier_share=0.9),
@@ -144,6 +144,6 @@ def test_the_summary_counts_what_was_flagged_and_means_are_over_what_was_registe
     assert summary["mean_inlier_share"] == pytest.approx(0.7)
 
 
-def test_means_over_nothing_are_none():
+def test_summary_means_over_nothing_are_none():
     assert summarize_health([Health(0)])["mean_rmse_m"] is None
     assert summarize_health([])["mean_iterations"] is None and summarize_health([])["flagged"] == 0

@@ -10,7 +10,7 @@ from lidarlearn.metrics import kitti
 from lidarlearn.metrics.kitti import SegmentAverage
 
 
-def test_a_perfect_trajectory_scores_zero_not_none(make_sequence):
+def test_exact_trajectory_scores_zero_not_none(make_sequence):
     sequence = make_sequence("a", 150)
     row = score("perfect", sequence.T_world_lidar, sequence, frames_per_second=12.5, health={"iterations": 3})
     assert (row.method, row.sequence, row.frames, row.frames_per_second) == ("perfect", "a", 150, 12.5)
@@ -24,7 +24,7 @@ def test_a_perfect_trajectory_scores_zero_not_none(make_sequence):
     assert row.relative_translation_error_percent < 1e-10
 
 
-def test_every_figure_has_its_unit(make_sequence, longer):
+def test_scores_of_longer_motions_match_closed_form(make_sequence, longer):
     sequence = make_sequence("a", 400)
     row = score("longer", longer(sequence.T_world_lidar, 0.02), sequence)
     motion = float(se3.relative(sequence.T_world_lidar)[:, :3, 3].norm(dim=-1).mean())
@@ -35,7 +35,7 @@ def test_every_figure_has_its_unit(make_sequence, longer):
     assert 1.8 < row.avg_translation_error_percent < 2.05  # the road winds, segments are shorter than their path
 
 
-def test_rotation_is_in_degrees(make_sequence):
+def test_rotation_errors_are_in_degrees(make_sequence):
     sequence = make_sequence("a", 300)
     turned = torch.zeros(299, 6, dtype=torch.float64)
     turned[:, 5] = math.radians(0.01)
@@ -45,7 +45,7 @@ def test_rotation_is_in_degrees(make_sequence):
     assert row.avg_rotation_error_deg_per_100m == pytest.approx(1, rel=0.02)
 
 
-def test_a_short_drive_has_no_kitti_figure_but_all_others(make_sequence, longer):
+def test_short_drive_has_all_scores_but_kittis(make_sequence, longer):
     sequence = make_sequence("short", 60)
     row = score("longer", longer(sequence.T_world_lidar, 0.02), sequence)
     assert row.segments == 0
@@ -56,7 +56,7 @@ def test_a_short_drive_has_no_kitti_figure_but_all_others(make_sequence, longer)
     assert row.rpe_translation_mean_m == pytest.approx(0.02, rel=1e-3)
 
 
-def test_without_ground_truth_nothing_is_known_but_the_frames(unknown_drive):
+def test_score_without_ground_truth_has_frames_alone(unknown_drive):
     row = score("any", se3.identity(5), unknown_drive, frames_per_second=3.0)
     assert row == Score("any", "unknown", 5, frames_per_second=3.0)
     assert row.registration_failures is None
@@ -64,7 +64,7 @@ def test_without_ground_truth_nothing_is_known_but_the_frames(unknown_drive):
     assert row.segments is None
 
 
-def test_a_single_scan_defines_nothing(make_sequence):
+def test_single_scan_has_no_scores(make_sequence):
     row = score("any", se3.identity(1), make_sequence("one", 1))
     assert row.path_length_m == 0
     undefined = (
@@ -76,7 +76,7 @@ def test_a_single_scan_defines_nothing(make_sequence):
     assert undefined == (None, None, None, None)
 
 
-def test_trajectories_are_compared_in_the_reference_frame(make_sequence, longer, T_camera_lidar):
+def test_scores_are_computed_in_reference_frame(make_sequence, longer, T_camera_lidar):
     sequence = make_sequence("a", 250, T_camera_lidar)
     estimate = longer(sequence.T_world_lidar, 0.03)
     row = score("longer", estimate, sequence)
@@ -86,7 +86,7 @@ def test_trajectories_are_compared_in_the_reference_frame(make_sequence, longer,
     assert row.path_length_m == float(kitti.path_distances(in_camera[1])[-1])
 
 
-def test_where_the_estimate_starts_does_not_matter(make_sequence, longer, T_camera_lidar):
+def test_scores_do_not_depend_on_first_pose(make_sequence, longer, T_camera_lidar):
     sequence = make_sequence("a", 250, T_camera_lidar)
     estimate = longer(sequence.T_world_lidar, 0.03)
     elsewhere = se3.exp(torch.tensor([500.0, 3, -8, 0.1, 0.2, 3.0], dtype=torch.float64)) @ estimate
@@ -96,7 +96,7 @@ def test_where_the_estimate_starts_does_not_matter(make_sequence, longer, T_came
     assert there.rpe_translation_m == pytest.approx(here.rpe_translation_m, rel=1e-9)
 
 
-def test_refuses_a_wrong_number_of_poses_and_poses_that_are_not_finite(make_sequence):
+def test_score_refuses_wrong_number_of_poses_and_nan(make_sequence):
     sequence = make_sequence("08", 60)
     with pytest.raises(TrajectoryError, match="'m' on sequence 08: 59 poses for 60 scans"):
         score("m", sequence.T_world_lidar[1:], sequence)
@@ -115,7 +115,7 @@ def rows_of_three_sequences(make_sequence, longer):
     ]
 
 
-def test_the_two_averages(make_sequence, longer):
+def test_average_scores_over_sequences_and_segments(make_sequence, longer):
     rows = rows_of_three_sequences(make_sequence, longer)
     (averages,) = average_scores(rows)
     a, b, _ = rows
@@ -132,7 +132,7 @@ def test_the_two_averages(make_sequence, longer):
     assert over_sequences.frames_per_second is None
 
 
-def test_methods_are_averaged_apart_in_order_of_appearance():
+def test_average_scores_keeps_methods_apart_in_order():
     rows = [
         Score("z", "1", 10, registration_failures=2, frames_per_second=10.0),
         Score("a", "1", 10),
@@ -146,7 +146,7 @@ def test_methods_are_averaged_apart_in_order_of_appearance():
     assert a.mean_over_segments.avg_translation_error_percent is None
 
 
-def test_pooling_by_length_weighs_by_the_number_of_segments():
+def test_pool_by_length_weights_by_segments():
     rows = [
         Score("m", "1", 10, by_segment_length={100: SegmentAverage(1, 1.0, 0.1)}),
         Score("m", "2", 10, by_segment_length={100: SegmentAverage(3, 2.0, 0.5), 200: SegmentAverage(2, 4.0, 0.0)}),

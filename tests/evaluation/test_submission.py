@@ -1,4 +1,4 @@
-"""What KITTI's test server gets."""
+"""Submissions to KITTI's test server."""
 
 import zipfile
 
@@ -13,14 +13,14 @@ def _test_set(T_camera_lidar, **changed):
     return [DriveWithoutScans(name, None, count, None, T_camera_lidar) for name, count in frames.items()]
 
 
-def test_only_all_eleven_whole_sequences_can_be_handed_in(T_camera_lidar):
+def test_submission_needs_all_eleven_whole_sequences(T_camera_lidar):
     assert is_kitti_test_set(_test_set(T_camera_lidar))
     assert not is_kitti_test_set(_test_set(T_camera_lidar)[1:])
     assert not is_kitti_test_set(_test_set(T_camera_lidar, **{"19": 100}))
     assert not is_kitti_test_set([DriveWithoutScans(name, None, n) for name, n in KITTI_TEST_FRAMES.items()])
 
 
-def test_the_files_lie_side_by_side_with_a_pose_a_row(tmp_path, make_drive):
+def test_submission_zip_holds_pose_files(tmp_path, make_drive):
     for name in KITTI_TEST_FRAMES:
         write_kitti_poses(Export(tmp_path / "cv+p_f2m", name).kitti, make_drive(7))
     with zipfile.ZipFile(write_submission(tmp_path / "submission.zip", tmp_path / "cv+p_f2m")) as archive:
@@ -29,7 +29,7 @@ def test_the_files_lie_side_by_side_with_a_pose_a_row(tmp_path, make_drive):
     assert len(rows) == 7 and all(len(row.split()) == 12 for row in rows)
 
 
-def test_the_benchmark_has_43552_scans():
+def test_kitti_frame_counts_add_up_to_43552():
     from lidarlearn.evaluation.published import KITTI_FRAMES
 
     assert sum(KITTI_FRAMES.values()) + sum(KITTI_TEST_FRAMES.values()) == 43552

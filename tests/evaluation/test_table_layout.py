@@ -1,4 +1,4 @@
-"""Tables as papers set them."""
+"""Tables with columns over several sequences, as in papers."""
 
 import pytest
 
@@ -24,19 +24,19 @@ def cells(table):
     return {row[0]: row[1:] for row in (*table.rows, *table.reference)}
 
 
-def test_a_cell_says_how_many_sequences_its_mean_is_over():
+def test_cell_shows_number_of_averaged_sequences():
     short = [Score("m", name, 51, 60.0, 0) for name in ("b", "c")]
     table = TableLayout("t", {"all": ["a", "b", "c"]}).table([row("m", "a", 1.0), *short])
     assert cells(table) == {"m": ("1.000 (1 of 3)",)}
     assert any(note.startswith("(n of m)") for note in table.notes)
 
 
-def test_a_sequence_that_is_there_twice_is_one_of_its_column():
+def test_repeated_sequence_counts_once():
     table = TableLayout("t", {"all": ["a", "b"]}).table([row("m", "a", 1.0), row("m", "a", 2.0)])
     assert cells(table) == {"m": ("1.500 (1 of 2)",)}
 
 
-def test_a_cell_is_the_mean_over_its_column_and_says_what_was_seen_in_training_or_is_missing():
+def test_cells_mark_training_sequences_and_missing_results():
     layout = TableLayout("t", COLUMNS, published={"cv+p_f2m": [0.7, None]}, source="Somebody 2020")
     table = layout.table(SCORES, {("posenet_icp+p_f2m", name) for name in "abx"})
     assert cells(table) == {
@@ -48,18 +48,18 @@ def test_a_cell_is_the_mean_over_its_column_and_says_what_was_seen_in_training_o
     assert "seen: a, b." in notes and "trained on these" in notes and "only so many" in notes
 
 
-def test_failures_are_added_up():
+def test_failures_are_summed():
     table = TableLayout("t", COLUMNS, "registration_failures").table(SCORES)
     assert cells(table)["posenet_icp+p_f2m"] == ("7", "1")
     assert any("the sum over" in note for note in table.notes)
 
 
-def test_a_network_that_saw_only_some_of_a_column_is_not_marked():
+def test_cell_partly_seen_in_training_is_not_marked():
     table = TableLayout("t", COLUMNS).table(SCORES, {("posenet_icp+p_f2m", "a")})
     assert cells(table)["posenet_icp+p_f2m"] == ("2.000", "9.000")
 
 
-def test_what_cannot_be_shown_is_refused():
+def test_layout_refuses_unknown_figure_and_wrong_value_count():
     with pytest.raises(ValueError, match=r"table\.figure=ate"):
         TableLayout("t", COLUMNS, "ate")
     with pytest.raises(ValueError, match=r"published\.m: 1 values for 2 columns"):

@@ -15,7 +15,7 @@ TABLE = Table(
 )
 
 
-def test_markdown():
+def test_markdown_table():
     assert TABLE.markdown().splitlines() == [
         "### Error [%]",
         "",
@@ -30,17 +30,17 @@ def test_markdown():
     ]
 
 
-def test_a_single_figure_is_not_the_best_of_anything():
+def test_single_figure_is_not_marked_as_best():
     alone = Table("t", ("method", "00"), (("a", "0.50"), ("b", "-")), lowest=frozenset({1}))
     assert "*" not in alone.markdown()
 
 
-def test_equal_figures_are_both_marked():
+def test_equal_best_figures_are_both_marked():
     tied = Table("t", ("method", "00"), (("a", "0.50"), ("b", "0.50"), ("c", "0.60")), lowest=frozenset({1}))
     assert tied.markdown().count("**0.50**") == 2
 
 
-def test_the_terminal_shows_the_same_cells_brackets_and_all():
+def test_terminal_shows_all_cells():
     out = StringIO()
     TABLE.print(Console(file=out, width=80))
     text = out.getvalue()
@@ -50,7 +50,7 @@ def test_the_terminal_shows_the_same_cells_brackets_and_all():
     assert "Error [%]" in text
 
 
-def test_a_narrow_terminal_wraps_labels_and_not_methods_and_figures():
+def test_narrow_terminal_wraps_labels_alone():
     out = StringIO()
     table = Table("t", ("method", "seq", "a [m]"), (("posenet+p_f2m", "simulated_urban", "123.456"),), labels=2)
     table.print(Console(file=out, width=32))
@@ -59,7 +59,7 @@ def test_a_narrow_terminal_wraps_labels_and_not_methods_and_figures():
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 100])
-def test_figures_that_find_no_room_come_below_and_do_not_fold(width):
+def test_columns_that_do_not_fit_are_printed_below(width):
     names = [f"{i:02d}" for i in range(11)]
     figures = [f"{100 + i}.{i:03d}*" for i in range(11)]
     reference = ("a method of somebody (published)", *(f"{i}.25" for i in range(11)))
@@ -75,7 +75,7 @@ def test_figures_that_find_no_room_come_below_and_do_not_fold(width):
     assert all(figure in out.getvalue() for figure in reference[1:])
 
 
-def test_what_is_best_stays_so_where_columns_come_below():
+def test_best_figures_stay_marked_in_columns_printed_below():
     table = Table(
         "t", ("method", "00", "01"), (("long+name", "0.5", "0.7"), ("b", "0.6", "0.2")), lowest=frozenset({1, 2})
     )
@@ -85,7 +85,7 @@ def test_what_is_best_stays_so_where_columns_come_below():
     assert text.count("method") == 2 and all(f"\x1b[1m{figure}" in text for figure in ("0.5", "0.2"))
 
 
-def test_a_table_without_rows_prints():
+def test_table_without_rows_is_printed():
     out = StringIO()
     empty = Table("t", ("method", "00"), (), lowest=frozenset({1}))
     empty.print(Console(file=out, width=36))

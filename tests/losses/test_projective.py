@@ -14,6 +14,7 @@ from tests.box_world import SMALL, cast
 FINE = type(SMALL)(height=32, width=360, fov_up_deg=15.0, fov_down_deg=-20.0)
 TRUTH = torch.tensor([[0.30, -0.05, 0.02, 0.004, -0.006, 0.02]], dtype=torch.float64)
 LOSSES = [IcpLoss(), WeightedIcpLoss(), WeightedIcpLoss(sigma_m=2.0)]
+NAMES = ["icp", "weighted_icp", "weighted_icp_2m"]
 
 
 @pytest.fixture(scope="module")
@@ -24,17 +25,17 @@ def pair():
     return reference, target
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-def test_it_vanishes_for_a_scan_against_itself(loss, pair):
+@pytest.mark.parametrize("loss", LOSSES, ids=NAMES)
+def test_loss_of_identical_scans_is_zero(loss, pair):
     result = loss(torch.zeros(1, 6), pair[0], pair[0], FINE)
     assert result.loss < 1e-9
     assert 0.3 < result.parts["activated_share"] <= 1
 
 
-@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("loss", LOSSES, ids=NAMES)
 @pytest.mark.parametrize("direction", range(6))
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_the_truth_is_better_than_any_way_off_it(loss, direction, sign, pair):
+def test_loss_is_lower_at_true_motion_than_off_it(loss, direction, sign, pair):
     truth = TRUTH.float()
     off = truth.clone()
     off[0, direction] += sign * (0.15 if direction < 3 else 0.03)
@@ -42,7 +43,7 @@ def test_the_truth_is_better_than_any_way_off_it(loss, direction, sign, pair):
 
 
 @pytest.mark.parametrize("direction", [0, 1])
-def test_the_misfit_grows_with_the_distance_and_ends_at_one(direction, pair):
+def test_misfit_grows_with_offset_up_to_one(direction, pair):
     def misfit(off_m):
         return LOSSES[1](TRUTH.float() + off_m * torch.eye(6)[direction], *pair, FINE).parts["misfit"].item()
 
@@ -50,8 +51,8 @@ def test_the_misfit_grows_with_the_distance_and_ends_at_one(direction, pair):
     assert values == sorted(values) and 0 < values[0] < 0.2 and values[-1] > 0.99
 
 
-@pytest.mark.parametrize("loss", LOSSES[:2])
-def test_descent_from_no_motion_finds_the_truth(loss, pair):
+@pytest.mark.parametrize("loss", LOSSES[:2], ids=NAMES[:2])
+def test_gradient_descent_recovers_motion(loss, pair):
     parameters = torch.zeros(1, 6, requires_grad=True)
     optimizer = torch.optim.Adam([parameters], lr=0.03)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.9)
@@ -65,8 +66,8 @@ def test_descent_from_no_motion_finds_the_truth(loss, pair):
     assert error[3:].norm() < 0.005
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-def test_pairs_of_a_batch_do_not_mix(loss, pair):
+@pytest.mark.parametrize("loss", LOSSES, ids=NAMES)
+def test_batch_loss_is_mean_of_pair_losses(loss, pair):
     reference, target = pair
     full = (reference, target)
     half = (reference * (torch.arange(FINE.width) < 120), target)  # far fewer activated pixels
@@ -78,8 +79,8 @@ def test_pairs_of_a_batch_do_not_mix(loss, pair):
         torch.testing.assert_close(together.parts[part], (alone[0].parts[part] + alone[1].parts[part]) / 2)
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-def test_one_pair_without_overlap_costs_nothing_and_pulls_nowhere(loss, pair):
+@pytest.mark.parametrize("loss", LOSSES, ids=NAMES)
+def test_pair_without_overlap_has_no_loss_and_gradient(loss, pair):
     reference = torch.cat([pair[0], torch.zeros_like(pair[0])])
     target = torch.cat([pair[1], pair[1]])
     parameters = torch.zeros(2, 6, requires_grad=True)
@@ -90,9 +91,9 @@ def test_one_pair_without_overlap_costs_nothing_and_pulls_nowhere(loss, pair):
     assert (parameters.grad[1] == 0).all()
 
 
-@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("loss", LOSSES, ids=NAMES)
 @pytest.mark.parametrize(("shares", "far_off"), [((1, 0), 0.0), ((0, 1), 0.0), ((1, 1), 1e4)])
-def test_without_any_overlap_loss_and_gradient_are_zero(loss, shares, far_off, pair):
+def test_batch_without_overlap_has_zero_loss_and_gradient(loss, shares, far_off, pair):
     reference, target = (share * image for share, image in zip(shares, pair, strict=True))
     parameters = torch.tensor([[0.0, 0, far_off, 0, 0, 0]], requires_grad=True)
     result = loss(parameters, reference, target, FINE)
@@ -109,9 +110,9 @@ def scattered(reference, phase):
     return torch.where(patch, factor * reference, reference)
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-def test_unused_pixels_do_not_matter(loss, pair):
-    """Reference points without a normal can lie anywhere, or nowhere."""
+@pytest.mark.parametrize("loss", LOSSES, ids=NAMES)
+def test_loss_ignores_reference_pixels_without_normal(loss, pair):
+    """Reference points without a normal may be anywhere, or missing."""
     reference, target = pair
     here, there = scattered(reference, 0), scattered(reference, 1)
     nowhere = torch.where(here == reference, reference, 0.0)
@@ -121,7 +122,7 @@ def test_unused_pixels_do_not_matter(loss, pair):
     assert (nowhere == 0).sum() > (reference == 0).sum() + 1000
 
 
-def test_icp_gradient_is_that_of_finite_differences(pair):
+def test_icp_gradient_matches_finite_differences(pair):
     """In double precision, away from the truth where |r| has kinks, with the association fixed by tiny steps."""
     reference, target = (m.double()[..., 8:24, :] for m in pair)
     projection = type(SMALL)(height=16, width=360, fov_up_deg=15.0 - 8 * 35 / 32, fov_down_deg=-20.0 + 8 * 35 / 32)
@@ -131,8 +132,8 @@ def test_icp_gradient_is_that_of_finite_differences(pair):
     )
 
 
-def test_weighted_gradient_is_that_of_reweighted_least_squares(pair):
-    """The weights are held: d/dp of w0 r(p)^2 with w0 taken at p."""
+def test_weighted_gradient_matches_reweighted_least_squares(pair):
+    """The weights are constants: d/dp of w0 r(p)^2 with w0 taken at p."""
     reference, target = (m.double() for m in pair)
     loss = WeightedIcpLoss(sigma_m=0.5)
     start = TRUTH * 0.5
@@ -153,8 +154,8 @@ def test_weighted_gradient_is_that_of_reweighted_least_squares(pair):
     torch.testing.assert_close(parameters.grad[0], numeric, atol=1e-5, rtol=1e-3)
 
 
-def test_icp_is_the_mean_distance_to_the_floor():
-    """Closed form: a plane lifted by 0.1 m is 0.1 m from itself wherever the association is."""
+def test_icp_loss_of_lifted_floor_is_its_height():
+    """Closed form: a plane lifted by 0.1 m is 0.1 m from itself, whatever the association."""
     x, y = torch.meshgrid(torch.linspace(-20, 20, 400), torch.linspace(-20, 20, 400), indexing="ij")
     floor = FINE.vertex_map(torch.stack([x, y, torch.full_like(x, -1.7)], dim=-1).reshape(-1, 3))[None]
     lifted = torch.tensor([[0.0, 0, 0.1, 0, 0, 0]])
@@ -164,25 +165,25 @@ def test_icp_is_the_mean_distance_to_the_floor():
 
 
 @pytest.mark.parametrize(("distance", "weight"), [(0.0, 1.0), (0.5, 0.36788), (1.0, 0.018316)])
-def test_weights_of_associations(distance, weight):
+def test_weighted_rho_matches_closed_form(distance, weight):
     rho = WeightedIcpLoss(sigma_m=0.5).rho(torch.tensor(0.2), torch.tensor(distance**2))
     assert float(rho) == pytest.approx(weight * 0.04, rel=1e-4)
 
 
-def test_reprojection_by_the_identity_changes_nothing(pair):
+def test_reprojection_by_identity_is_identity(pair):
     torch.testing.assert_close(reproject(se3.identity(1), pair[0], FINE), pair[0])
 
 
-def test_empty_pixels_do_not_become_points():
+def test_reprojection_keeps_empty_pixels_empty():
     target = torch.zeros(1, 3, FINE.height, FINE.width)
     assert not reproject(se3.from_euler(torch.ones(1, 6)), target, FINE).any()
 
 
-def test_reprojection_is_that_of_the_transformed_points(pair):
-    """The same image as `vertex_map` makes of the points, and the same pull on the motion."""
+def test_reprojection_equals_vertex_map_of_transformed_points(pair):
+    """The same image and the same gradient of the motion."""
     target = torch.cat([pair[1], pair[0] * (torch.rand(FINE.height, FINE.width) < 0.5)])
     weights = torch.randn(target.shape, generator=torch.Generator().manual_seed(0))
-    images, pulls = [], []
+    images, gradients = [], []
     for way in ("map", "points"):
         parameters = torch.tensor([[0.3, 0.1, 0, 0, 0.01, 0.1], [0, 0, 0.2, 0.05, 0, -2.0]], requires_grad=True)
         T = se3.from_euler(parameters)
@@ -193,7 +194,7 @@ def test_reprojection_is_that_of_the_transformed_points(pair):
             image = FINE.vertex_map(torch.where(activated(target).flatten(1)[..., None], points, 0.0))
         (image * weights).sum().backward()
         images.append(image.detach())
-        pulls.append(parameters.grad)
+        gradients.append(parameters.grad)
     same = ((images[0] - images[1]).abs().amax(1) < 1e-4).float().mean()
     assert same > 0.999  # points exactly on a pixel's border may change sides
-    torch.testing.assert_close(pulls[0], pulls[1], rtol=0.01, atol=0.01 * float(pulls[1].abs().max()))
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=0.01, atol=0.01 * float(gradients[1].abs().max()))

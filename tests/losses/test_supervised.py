@@ -14,7 +14,7 @@ def motions(n, seed=0):
     return torch.randn(n, 6, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 0.1, 0.1, 0.02, 0.02, 0.1])
 
 
-def test_the_formula():
+def test_loss_matches_formula():
     truth, estimate = motions(5), motions(5, seed=1)
     loss = SupervisedLoss(initial_s1=0.3, initial_s2=2.0)
     t = ((truth - estimate)[:, :3] ** 2).sum(1)
@@ -25,7 +25,7 @@ def test_the_formula():
     torch.testing.assert_close(result.parts["translation_squared_m2"], t.mean())
 
 
-def test_gradients_of_estimates_and_of_learned_weights():
+def test_gradients_of_estimates_and_weights():
     truth, estimate = se3.from_euler(motions(3)), motions(3, seed=1).requires_grad_()
     loss = SupervisedLoss(0.3, 2.0).double()
 
@@ -36,7 +36,7 @@ def test_gradients_of_estimates_and_of_learned_weights():
     assert torch.autograd.gradcheck(value, (estimate, s1, s2))
 
 
-def test_the_best_weights_are_the_precisions():
+def test_learned_weights_converge_to_precisions():
     truth, estimate = motions(50), motions(50, seed=1)
     loss = SupervisedLoss().double()
     optimizer = torch.optim.Adam(loss.parameters(), lr=0.05)
@@ -49,7 +49,7 @@ def test_the_best_weights_are_the_precisions():
     assert loss.s2.item() == pytest.approx(-math.log(result.parts["rotation_squared_rad2"].item()), abs=0.02)
 
 
-def test_weights_stop_growing_where_nothing_is_left_to_learn_and_fall_again_where_something_is():
+def test_weights_are_bounded_and_fall_when_errors_grow():
     truth = motions(4)
     loss = SupervisedLoss(initial_s1=20.0, initial_s2=13.9, max_s=14.0)
     optimizer = torch.optim.Adam(loss.parameters(), lr=0.05)
@@ -63,7 +63,7 @@ def test_weights_stop_growing_where_nothing_is_left_to_learn_and_fall_again_wher
 
     values = [step(truth) for _ in range(20)]
     assert values[-1] == pytest.approx(-28.0, abs=0.01)
-    assert max(loss.s1.item(), loss.s2.item()) <= 14.0 + 0.06  # until the next step puts it back
+    assert max(loss.s1.item(), loss.s2.item()) <= 14.0 + 0.06  # clamped in the next step
     for _ in range(200):
         step(truth + 0.05)
     assert max(loss.s1.item(), loss.s2.item()) < 11

@@ -21,19 +21,19 @@ def evo_ape_rmse(estimate, truth):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_agrees_with_evo(winding_drive, perturbed, seed):
+def test_ape_agrees_with_evo(winding_drive, perturbed, seed):
     truth = winding_drive()
     estimate = MOVED @ perturbed(truth, scale=2.0, seed=seed)
     assert ape_rmse(estimate, truth) == pytest.approx(evo_ape_rmse(estimate, truth), abs=1e-9)
 
 
-def test_no_error_when_only_the_world_frame_differs(winding_drive):
+def test_ape_does_not_depend_on_world_frame(winding_drive):
     truth = winding_drive()
     assert ape_rmse(MOVED @ truth, truth) == pytest.approx(0, abs=1e-10)
 
 
-def test_scale_is_not_aligned(straight_line):
-    """n points along a line, 10 % too far apart: what is left is 0.1 of their standard deviation."""
+def test_align_does_not_estimate_scale(straight_line):
+    """The error of points on a line, 10 % too far apart, is a tenth of their standard deviation."""
     truth = straight_line(100)
     estimate = truth.clone()
     estimate[:, 0, 3] *= 1.1
@@ -42,8 +42,8 @@ def test_scale_is_not_aligned(straight_line):
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, -2.0, 3.0), (-1.0, 0.0, 0.0)])
-def test_straight_lines_align(straight_line, direction):
-    """The covariance has rank one; the rotation about the line is free, the error is not."""
+def test_align_straight_lines(straight_line, direction):
+    """The covariance has rank one: the rotation about the line is arbitrary, the error is not."""
     truth = straight_line(300)
     axis = torch.tensor(direction, dtype=torch.float64)
     estimate = truth.clone()
@@ -54,24 +54,24 @@ def test_straight_lines_align(straight_line, direction):
     assert ape_rmse(estimate, truth) == pytest.approx(0, abs=1e-10)
 
 
-def test_two_poses_differ_by_half_the_difference_of_their_distances(straight_line):
+def test_ape_of_two_poses_is_half_their_difference_in_distance(straight_line):
     truth, estimate = straight_line(1), straight_line(1)
     estimate[1, 0, 3] = 1.4
     assert ape_rmse(MOVED @ estimate, truth) == pytest.approx(0.2, abs=1e-12)
 
 
-def test_three_poses_and_poses_in_one_place(winding_drive):
+def test_ape_of_three_poses_and_of_coincident_poses(winding_drive):
     truth = winding_drive(3)
     assert ape_rmse(MOVED @ truth, truth) == pytest.approx(0, abs=1e-12)
     standing = se3.identity(4)
     assert ape_rmse(MOVED @ standing, standing) == pytest.approx(0, abs=1e-12)
 
 
-def test_one_pose_has_no_error_to_speak_of():
+def test_ape_of_one_pose_is_none():
     assert ape_rmse(se3.identity(1), se3.identity(1)) is None
 
 
-def test_a_mirrored_path_is_not_taken_for_the_same(winding_drive):
+def test_align_does_not_mirror(winding_drive):
     truth = winding_drive()
     mirrored = truth.clone()
     mirrored[:, :3, 3] *= torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
@@ -82,7 +82,7 @@ def test_a_mirrored_path_is_not_taken_for_the_same(winding_drive):
     assert ape_rmse(mirrored, truth) > 0.1
 
 
-def test_alignment_is_scipys(winding_drive, perturbed):
+def test_align_agrees_with_scipy(winding_drive, perturbed):
     truth = winding_drive()
     estimate = MOVED @ perturbed(truth, scale=5.0)
     target, source = truth[:, :3, 3], estimate[:, :3, 3]
@@ -91,13 +91,13 @@ def test_alignment_is_scipys(winding_drive, perturbed):
     assert torch.allclose(R, torch.from_numpy(expected.as_matrix()), atol=1e-9)
 
 
-def test_errors_are_distances_after_alignment(winding_drive, perturbed):
+def test_absolute_errors_have_ape_as_rms(winding_drive, perturbed):
     truth = winding_drive()
     errors = absolute_errors(perturbed(truth), truth)
     assert errors.shape == (len(truth),)
     assert errors.square().mean().sqrt() == pytest.approx(ape_rmse(perturbed(truth), truth))
 
 
-def test_refuses_different_numbers_of_poses():
+def test_ape_refuses_different_numbers_of_poses():
     with pytest.raises(ValueError, match="1 estimated poses against 3"):
         ape_rmse(se3.identity(1), se3.identity(3))

@@ -5,8 +5,8 @@ from lidarlearn.geometry import se3
 from lidarlearn.metrics.checks import check_comparable
 
 
-@pytest.mark.parametrize("which", [0, 1])
-def test_single_precision_is_refused_and_named(which):
+@pytest.mark.parametrize("which", [0, 1], ids=["estimated", "ground_truth"])
+def test_check_comparable_refuses_float32(which):
     poses = [se3.identity(3), se3.identity(3)]
     check_comparable(*poses)
     poses[which] = poses[which].float()
@@ -15,7 +15,7 @@ def test_single_precision_is_refused_and_named(which):
         check_comparable(*poses)
 
 
-def test_poses_of_numpy_are_no_tensors():
-    compare = getattr(check_comparable, "__wrapped__", check_comparable)  # past the checks of types that tests have
+def test_check_comparable_refuses_numpy():
+    compare = getattr(check_comparable, "__wrapped__", check_comparable)  # without jaxtyping's checks
     with pytest.raises(ValueError, match="must be float64 tensors, got ndarray of float64"):
         compare(torch.eye(4, dtype=torch.float64).repeat(3, 1, 1).numpy(), se3.identity(3))

@@ -17,7 +17,7 @@ from lidarlearn.metrics.kitti import (
 
 
 def literal_definition(estimate, truth):
-    """The benchmark's definition word by word: (first frame, length, translation, rotation) of every segment."""
+    """The benchmark's definition in plain loops: (first frame, length, translation, rotation) of every segment."""
     dist = [0.0]
     for a, b in pairwise(truth):
         dist.append(dist[-1] + math.sqrt(sum((b[k, 3] - a[k, 3]) ** 2 for k in range(3))))
@@ -36,7 +36,7 @@ def literal_definition(estimate, truth):
     return np.array(rows)
 
 
-def test_one_percent_scale_error_on_a_straight_kilometre(straight_line):
+def test_scale_error_of_one_percent_matches_closed_form(straight_line):
     truth = straight_line(1000)
     estimate = truth.clone()
     estimate[:, 0, 3] *= 1.01
@@ -60,7 +60,7 @@ def test_identical_trajectories_have_no_error(winding_drive):
 
 
 @pytest.mark.parametrize(("metres", "segments"), [(100, 0), (101, 1), (110, 1), (111, 2), (201, 12)])
-def test_the_end_frame_lies_strictly_beyond_the_length(straight_line, metres, segments):
+def test_segment_ends_strictly_beyond_its_length(straight_line, metres, segments):
     line = straight_line(metres)
     errors = segment_errors(line, line)
     assert len(errors.length_m) == segments
@@ -75,7 +75,7 @@ def test_too_few_poses_have_no_segment(straight_line, poses):
     assert average_by_length(segment_errors(line, line)) == {}
 
 
-def test_constant_yaw_drift_is_its_rate(straight_line):
+def test_rotation_error_is_rate_of_constant_yaw_drift(straight_line):
     truth = straight_line(400)
     rate = math.radians(0.5) / 100  # rad per metre
     yaw = rate * torch.arange(len(truth), dtype=torch.float64)
@@ -90,7 +90,7 @@ def test_constant_yaw_drift_is_its_rate(straight_line):
     assert by_length[200].rotation_deg_per_100m == pytest.approx(0.5 * 201 / 200)
 
 
-def test_agrees_with_the_literal_definition(winding_drive, perturbed):
+def test_segment_errors_agree_with_literal_definition(winding_drive, perturbed):
     truth = winding_drive(700, speed=1.4)
     estimate = perturbed(truth, seed=3)
     expected = literal_definition(estimate.numpy(), truth.numpy())
@@ -102,7 +102,7 @@ def test_agrees_with_the_literal_definition(winding_drive, perturbed):
     np.testing.assert_allclose(errors.rotation.numpy(), expected[:, 3], rtol=1e-6)
 
 
-def test_standing_still_is_like_the_definition(straight_line, perturbed):
+def test_standing_still_agrees_with_literal_definition(straight_line, perturbed):
     """Frames without motion: distances that do not grow."""
     moving = straight_line(150)
     waiting = torch.cat([moving[:50], moving[50:51].repeat(30, 1, 1), moving[51:]])
@@ -112,8 +112,8 @@ def test_standing_still_is_like_the_definition(straight_line, perturbed):
     np.testing.assert_allclose(errors.translation.numpy(), expected[:, 2], rtol=1e-9)
 
 
-def test_matrices_that_are_no_exact_rotations_are_inverted_as_they_are(winding_drive, perturbed):
-    """Poses with seven digits: a transpose in place of the inverse would show in the rotation error."""
+def test_rounded_rotations_are_inverted_not_transposed(winding_drive, perturbed):
+    """Poses with seven digits: a transpose in place of the inverse changes the rotation error."""
     truth, estimate = ((1e6 * T).round() / 1e6 for T in (winding_drive(300), perturbed(winding_drive(300), 0.3)))
     expected = literal_definition(estimate.numpy(), truth.numpy())
     errors = segment_errors(estimate, truth)
@@ -121,7 +121,7 @@ def test_matrices_that_are_no_exact_rotations_are_inverted_as_they_are(winding_d
     np.testing.assert_allclose(errors.rotation.numpy(), expected[:, 3], rtol=1e-6)
 
 
-def test_world_frames_do_not_matter(winding_drive, perturbed):
+def test_segment_errors_do_not_depend_on_world_frames(winding_drive, perturbed):
     truth = winding_drive()
     estimate = perturbed(truth)
     T_a = se3.exp(torch.tensor([100.0, -20, 5, 0.3, -1.0, 2.0], dtype=torch.float64))
@@ -131,7 +131,7 @@ def test_world_frames_do_not_matter(winding_drive, perturbed):
     assert torch.allclose(here.rotation, there.rotation, rtol=1e-6)
 
 
-def test_average_by_length_adds_up_to_the_average(winding_drive, perturbed):
+def test_average_by_length_is_consistent_with_average(winding_drive, perturbed):
     truth = winding_drive()
     errors = segment_errors(perturbed(truth), truth)
     mean, by_length = average(errors), average_by_length(errors)
@@ -150,14 +150,14 @@ def test_average_converts_units():
     assert mean.rotation_deg_per_100m == pytest.approx(1.0)
 
 
-def test_distances_are_in_3d():
+def test_path_distances_are_3d():
     T = se3.identity(3)
     T[1, :3, 3] = torch.tensor([1.0, 2.0, 2.0])
     T[2, :3, 3] = torch.tensor([1.0, 2.0, 14.0])
     assert path_distances(T).tolist() == [0, 3, 15]
 
 
-def test_refuses_what_cannot_be_compared(straight_line):
+def test_segment_errors_refuse_incomparable_trajectories(straight_line):
     line = straight_line(200)
     with pytest.raises(ValueError, match="200 estimated poses against 201"):
         segment_errors(line[:-1], line)
@@ -170,8 +170,8 @@ def test_refuses_what_cannot_be_compared(straight_line):
 
 
 @pytest.mark.realdata
-def test_on_kitti_04_as_published(real_data: Path, perturbed):
-    """The official poses: rotations to seven digits only, which no transpose inverts."""
+def test_segment_errors_on_published_kitti_04_poses(real_data: Path, perturbed):
+    """The official rotations have seven digits: their transpose is not their inverse."""
     rows = torch.from_numpy(np.loadtxt(real_data / "kitti_odometry" / "poses" / "04.txt"))
     truth = se3.identity(len(rows))
     truth[:, :3] = rows.unflatten(1, (3, 4))

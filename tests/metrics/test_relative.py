@@ -15,7 +15,7 @@ def evo_rpe(estimate, truth, relation):
     return rpe.get_all_statistics()
 
 
-def test_agrees_with_evo(winding_drive, perturbed):
+def test_rpe_agrees_with_evo(winding_drive, perturbed):
     truth = winding_drive()
     estimate = perturbed(truth)
     ours = relative_pose_error(estimate, truth)
@@ -28,13 +28,13 @@ def test_agrees_with_evo(winding_drive, perturbed):
 
 
 @pytest.mark.parametrize("angle", [1e-9, 1e-6, 1e-3, 0.5, 3.0])
-def test_the_angle_is_right_from_tiny_to_large(angle):
+def test_rotation_error_is_accurate_from_tiny_to_large(angle):
     truth = se3.identity(2)
     estimate = se3.accumulate(se3.exp(torch.tensor([[0.3, 0, 0, 0, angle, 0]], dtype=torch.float64)))
     assert relative_errors(estimate, truth).rotation.item() == pytest.approx(angle, rel=1e-6)
 
 
-def test_one_wrong_motion_is_one_wrong_pair(winding_drive):
+def test_wrong_motion_affects_one_pair(winding_drive):
     truth = winding_drive(50)
     motions = se3.relative(truth)
     motions[20] = motions[20] @ se3.exp(torch.tensor([0, 0.3, 0.4, 0, 0, 0], dtype=torch.float64))
@@ -43,12 +43,12 @@ def test_one_wrong_motion_is_one_wrong_pair(winding_drive):
     assert torch.cat([errors.translation[:20], errors.translation[21:]]).max() < 1e-12
 
 
-def test_a_single_pose_has_no_motion():
+def test_relative_errors_of_single_pose_are_none():
     assert relative_pose_error(se3.identity(1), se3.identity(1)) is None
     assert relative_translation_error(se3.identity(1), se3.identity(1)) is None
 
 
-def test_motion_error_as_a_share_of_the_motion(winding_drive):
+def test_relative_translation_error_is_share_of_motion(winding_drive):
     truth = winding_drive()
     assert relative_translation_error(truth, truth) == pytest.approx(0, abs=1e-12)
     assert relative_translation_error(se3.identity(len(truth)), truth) == pytest.approx(1)
@@ -57,11 +57,11 @@ def test_motion_error_as_a_share_of_the_motion(winding_drive):
     assert relative_translation_error(se3.accumulate(longer), truth) == pytest.approx(0.1)
 
 
-def test_motion_error_is_not_defined_without_motion(winding_drive):
+def test_relative_translation_error_without_motion_is_none(winding_drive):
     assert relative_translation_error(winding_drive(10), se3.identity(10)) is None
 
 
-def test_motion_error_is_the_mean_rpe_over_the_mean_motion(winding_drive, perturbed):
+def test_relative_translation_error_is_mean_rpe_over_mean_motion(winding_drive, perturbed):
     truth = winding_drive()
     estimate = perturbed(truth)
     rpe = relative_pose_error(estimate, truth)
@@ -70,12 +70,12 @@ def test_motion_error_is_the_mean_rpe_over_the_mean_motion(winding_drive, pertur
     assert relative_translation_error(estimate, truth) == pytest.approx(rpe.translation_mean_m / motion)
 
 
-def test_speeds_leave_out_pairs_without_elapsed_time(straight_line):
+def test_speeds_skip_pairs_without_elapsed_time(straight_line):
     times = torch.tensor([0.0, 0.5, 0.5, 1.5], dtype=torch.float64)
     assert speeds(straight_line(3), times).tolist() == [2.0, 1.0]
 
 
-def test_refuses_values_that_are_not_finite(straight_line):
+def test_relative_errors_refuse_infinite_values(straight_line):
     line = straight_line(5)
     broken = line.clone()
     broken[3, 0, 0] = math.inf

@@ -18,7 +18,7 @@ pytestmark = [
 ]
 
 
-def test_empty_pixels_are_black_and_others_are_not():
+def test_range_image_is_black_at_empty_pixels_only():
     vertex_map = SMALL.vertex_map(cast(se3.identity()))
     vertex_map[:, :, :20] = 0
     image = range_image(vertex_map, max_range_m=60.0)
@@ -27,7 +27,7 @@ def test_empty_pixels_are_black_and_others_are_not():
     assert 0 <= image.min() and image.max() <= 1
 
 
-def test_a_range_has_one_colour_whatever_its_direction():
+def test_range_image_colour_depends_on_range_alone():
     near, far = torch.tensor([3.0, 0, 0]), torch.tensor([0.0, 30, 0])
     vertex_map = torch.stack([near, near[[1, 0, 2]], far, far[[1, 0, 2]]], dim=1)[:, None]
     image = range_image(vertex_map, 60.0)[:, 0]
@@ -36,28 +36,28 @@ def test_a_range_has_one_colour_whatever_its_direction():
     assert not torch.allclose(image[:, 0], image[:, 2])
 
 
-def test_normals_as_colours():
+def test_normal_image_maps_components_to_rgb():
     up, left = torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 1, 0])
     image = normal_image(torch.stack([up, left, torch.zeros(3)], dim=1)[:, None])[:, 0].T
     assert image.tolist() == [[0.5, 0.5, 1], [0.5, 1, 0.5], [0, 0, 0]]
     assert normal_image(normal_map(SMALL.vertex_map(cast(se3.identity())))).amin() >= 0
 
 
-def test_values_beyond_the_scale_take_its_end():
+def test_scalar_image_clamps_to_largest_value():
     values, valid = torch.tensor([[0.0, 1.0, 5.0, 5.0]]), torch.tensor([[True, True, True, False]])
     image = scalar_image(values, valid, largest=1.0)[:, 0].T
     assert image[1].tolist() == image[2].tolist() != image[0].tolist()
     assert image[3].tolist() == [0, 0, 0]
 
 
-def test_enlarging_repeats_pixels():
+def test_enlarged_repeats_pixels():
     image = torch.rand(3, 16, 4)
     large = enlarged(image)
     assert large.shape == (3, 192, 24)
     torch.testing.assert_close(large[:, ::12, ::6], image)
 
 
-def test_a_drive_is_drawn_as_the_network_predicts_it_after_that_epoch(tmp_path, monkeypatch):
+def test_trajectories_are_those_of_the_current_network(tmp_path, monkeypatch):
     drawn = {}
 
     def figure(title, T_true, T_estimates):
@@ -73,7 +73,7 @@ def test_a_drive_is_drawn_as_the_network_predicts_it_after_that_epoch(tmp_path, 
     assert not drawn and (first - last).abs().max() > 1e-2
 
 
-def test_images_are_drawn_as_often_as_validation_allows(tmp_path):
+def test_drawings_follow_every_n_epochs_of_validation(tmp_path):
     seldom = [f"callbacks.{name}.every_n_epochs=3" for name in ("images", "trajectories")]
     often = ("trainer.max_epochs=6", "trainer.check_val_every_n_epoch=2", "+trainer.limit_train_batches=1")
     train(configured(tmp_path, *seldom, *often, draws=True, frames=5), data_name="boxes")

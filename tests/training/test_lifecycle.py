@@ -32,7 +32,7 @@ def run(request, tmp_path_factory, small_network):
     return folder, best, request.param
 
 
-def test_the_run_folder_is_whole(run):
+def test_run_folder_holds_checkpoints_config_revision_and_events(run):
     folder, best, _ = run
     assert best == folder / "checkpoints" / "best.ckpt"
     assert sorted(p.name for p in (folder / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
@@ -41,7 +41,7 @@ def test_the_run_folder_is_whole(run):
     assert list(folder.glob("events.out.tfevents*")) and not (folder / "hparams.yaml").exists()
 
 
-def test_the_loss_falls(run):
+def test_loss_falls(run):
     folder, _, loss = run
     # The supervised loss has no lower bound to fall towards: its squared error has.
     what = "translation_squared_m2" if loss == "supervised" else "loss"
@@ -50,7 +50,7 @@ def test_the_loss_falls(run):
     assert min(losses[1:]) < 0.9 * losses[0]
 
 
-def test_the_curves_that_were_promised(run):
+def test_curves_are_logged(run):
     folder, _, loss = run
     tags = curves(folder).keys()
     parts = {"s1", "s2"} if loss == "supervised" else {"activated_share", "residual_m"}
@@ -58,12 +58,12 @@ def test_the_curves_that_were_promised(run):
     assert {"train/loss_step", "lr-Adam", "val/loss", "val/error", "val/mean_relative_translation_error_m"} <= tags
 
 
-def test_the_images_that_were_promised(run):
+def test_images_and_trajectories_are_logged(run):
     tags = " ".join(images(run[0]))
     assert all(word in tags for word in ("vertex map", "normal map", "trajectory 2"))
 
 
-def test_a_checkpoint_is_plain_data_that_says_what_it_was_trained_on(run):
+def test_checkpoint_records_what_it_was_trained_on(run):
     _folder, best, loss = run
     trained_on = torch.load(best, weights_only=True)["hyper_parameters"]["trained_on"]
     assert trained_on["data_name"] == "boxes"
@@ -73,7 +73,7 @@ def test_a_checkpoint_is_plain_data_that_says_what_it_was_trained_on(run):
     assert {"git", "lidarlearn"} <= trained_on.keys()
 
 
-def test_a_checkpoint_alone_gives_the_error_that_was_logged(run):
+def test_loaded_checkpoint_reproduces_logged_validation_error(run):
     folder, _, loss = run
     module = PoseNetModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
     assert isinstance(module, SupervisedModule if loss == "supervised" else UnsupervisedModule)
@@ -84,14 +84,14 @@ def test_a_checkpoint_alone_gives_the_error_that_was_logged(run):
     assert float(error) == pytest.approx(logged, rel=1e-3)
 
 
-def test_best_is_the_epoch_with_the_smallest_validation_error(run):
+def test_best_checkpoint_has_smallest_validation_error(run):
     folder, best, _ = run
     errors = [value for _, value in curves(folder)["val/error"]]
     assert load_checkpoint(best)["epoch"] == min(range(EPOCHS), key=errors.__getitem__)
     assert load_checkpoint(best.with_name("last.ckpt"))["epoch"] == EPOCHS - 1
 
 
-def test_resuming_goes_on_at_the_right_epoch(run, tmp_path):
+def test_resuming_continues_at_next_epoch(run, tmp_path):
     folder, _best, loss = run
     config = configured(
         tmp_path / "resumed",
@@ -108,97 +108,103 @@ def test_resuming_goes_on_at_the_right_epoch(run, tmp_path):
     assert steps == list(range(EPOCHS * 8, (EPOCHS + 1) * 8))
 
 
-def test_a_folder_that_holds_another_training_is_refused(run, tmp_path):
+def test_run_folder_of_another_training_is_refused(run, tmp_path):
     folder, best, loss = run
     for ckpt in ((), (f"ckpt={tmp_path}/elsewhere/last.ckpt",)):
         with pytest.raises(UserError, match=r"another training(.|\n)*hydra\.run\.dir(.|\n)*ckpt=.*last\.ckpt"):
             train(configured(folder, f"loss={loss}", *ckpt, frames=5), data_name="boxes")
-    with pytest.raises(UserError, match="already seen"):  # going on in the same folder is another matter
+    with pytest.raises(UserError, match="already seen"):  # resuming in its own folder is accepted
         train(configured(folder, f"loss={loss}", f"ckpt={best}", "trainer.max_epochs=1", frames=5), data_name="boxes")
 
 
 @pytest.mark.parametrize(
-    ("most", "words"),
+    ("limit", "message"),
     [
-        (f"trainer.max_epochs={EPOCHS}", r"already seen 3 of 3 epochs\n  change: trainer\.max_epochs=6"),
-        ("trainer.max_steps=20", r"already seen 24 of 20 steps\n  change: trainer\.max_steps=48"),
+        pytest.param(
+            f"trainer.max_epochs={EPOCHS}",
+            r"already seen 3 of 3 epochs\n  change: trainer\.max_epochs=6",
+            id="max_epochs",
+        ),
+        pytest.param(
+            "trainer.max_steps=20", r"already seen 24 of 20 steps\n  change: trainer\.max_steps=48", id="max_steps"
+        ),
     ],
 )
-def test_resuming_where_nothing_is_left_says_so(run, tmp_path, most, words):
+def test_resuming_a_finished_training_is_refused(run, tmp_path, limit, message):
     folder, _, loss = run
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    config = configured(tmp_path / "r", f"loss={loss}", most, f"ckpt={checkpoint}", frames=5)
-    with pytest.raises(UserError, match=words):
+    config = configured(tmp_path / "r", f"loss={loss}", limit, f"ckpt={checkpoint}", frames=5)
+    with pytest.raises(UserError, match=message):
         train(config, data_name="boxes")
 
 
-def test_resuming_with_another_model_says_so(run, tmp_path):
+def test_resuming_with_another_model_is_refused(run, tmp_path):
     _folder, best, loss = run
     config = configured(tmp_path / "r", f"loss={loss}", "model.backbone=resnet34", f"ckpt={best}", frames=5)
     with pytest.raises(UserError, match="another model: backbone was resnet18"):
         train(config, data_name="boxes")
 
 
-def resumed(folder, ended, run_dir, loss, **drives):
-    """Go on for an epoch from a copy of a folder, at a rate that spoils the network; the best checkpoint then."""
+def resume_worse(folder, ended, run_dir, loss, **drives):
+    """Resume for an epoch at a rate that ruins the network, from copied checkpoints; the best checkpoint."""
     last = folder / "checkpoints" / "last.ckpt"
     content = torch.load(last, weights_only=True)
     for group in content["optimizer_states"][0]["param_groups"]:
         group["lr"] = group["initial_lr"] = 1.0
-    spoilt = ended / "checkpoints"
-    spoilt.mkdir()
-    torch.save(content, spoilt / "last.ckpt")
-    (spoilt / "best.ckpt").write_bytes((folder / "checkpoints" / "best.ckpt").read_bytes())
-    settings = (f"loss={loss}", f"trainer.max_epochs={EPOCHS + 1}", f"ckpt={spoilt}/last.ckpt")
+    copied = ended / "checkpoints"
+    copied.mkdir()
+    torch.save(content, copied / "last.ckpt")
+    (copied / "best.ckpt").write_bytes((folder / "checkpoints" / "best.ckpt").read_bytes())
+    settings = (f"loss={loss}", f"trainer.max_epochs={EPOCHS + 1}", f"ckpt={copied}/last.ckpt")
     return load_checkpoint(train(configured(run_dir, *settings, frames=FRAMES, **drives), data_name="boxes"))
 
 
-def test_best_of_a_resumed_training_is_the_best_of_all(run, tmp_path):
+def test_resuming_keeps_best_checkpoint_if_later_epochs_are_worse(run, tmp_path):
     folder, best, loss = run
-    after = resumed(folder, tmp_path, tmp_path / "resumed", loss)
+    after = resume_worse(folder, tmp_path, tmp_path / "resumed", loss)
     worse = curves(tmp_path / "resumed")["val/error"][0][1]
     assert worse > min(value for _, value in curves(folder)["val/error"])
     assert after["epoch"] == load_checkpoint(best)["epoch"]
 
 
-def test_best_is_chosen_anew_where_other_drives_are_held_out(run, tmp_path):
+def test_resuming_with_other_validation_drives_selects_best_anew(run, tmp_path):
     folder, _, loss = run
-    assert resumed(folder, tmp_path, tmp_path / "resumed", loss, val_sequences=["1"])["epoch"] == EPOCHS
+    assert resume_worse(folder, tmp_path, tmp_path / "resumed", loss, val_sequences=["1"])["epoch"] == EPOCHS
 
 
-def test_what_validation_does_not_see_leaves_the_best_as_it_is(run, tmp_path):
+def test_resuming_with_other_training_drives_keeps_best_checkpoint(run, tmp_path):
     folder, best, loss = run
-    after = resumed(folder, tmp_path, tmp_path, loss, train_sequences=["1"])  # in the same folder
+    after = resume_worse(folder, tmp_path, tmp_path, loss, train_sequences=["1"])  # in the same folder
     assert after["epoch"] == load_checkpoint(best)["epoch"]
     assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
 
 
-def test_a_best_checkpoint_that_does_not_compare_is_kept(run, tmp_path):
+def test_resuming_renames_best_checkpoint_it_cannot_compare(run, tmp_path):
     folder, best, loss = run
     with pytest.warns(UserWarning, match=r"another way \(data\.val_sequences\)(.|\n)*best_before_epoch_004\.ckpt"):
-        assert resumed(folder, tmp_path, tmp_path, loss, val_sequences=["1"])["epoch"] == EPOCHS
+        assert resume_worse(folder, tmp_path, tmp_path, loss, val_sequences=["1"])["epoch"] == EPOCHS
     assert (tmp_path / "checkpoints" / "best_before_epoch_004.ckpt").read_bytes() == best.read_bytes()
 
 
 @pytest.mark.slow
-def test_a_loss_does_not_compare_with_a_misfit(tmp_path):
-    """Without ground truth earlier versions chose by the loss, and did not say so."""
+def test_resuming_does_not_compare_misfit_with_loss(tmp_path):
+    """Without ground truth, earlier versions selected by the loss, and did not record that."""
     drives = {"frames": 9, "without_truth": ["0", "2"]}
     train(configured(tmp_path, "trainer.max_epochs=1", **drives), data_name="boxes")
     checkpoints = tmp_path / "checkpoints"
     content = torch.load(checkpoints / "best.ckpt", weights_only=True)
     content["best_error"] = 0 * content["best_error"]
     torch.save(content, checkpoints / "best.ckpt")
-    goes_on = configured(tmp_path, "trainer.max_epochs=2", f"ckpt={checkpoints}/last.ckpt", **drives)
-    assert load_checkpoint(train(goes_on, data_name="boxes"))["epoch"] == 0
+    resumed = configured(tmp_path, "trainer.max_epochs=2", f"ckpt={checkpoints}/last.ckpt", **drives)
+    assert load_checkpoint(train(resumed, data_name="boxes"))["epoch"] == 0
     del content["best_error_is"]
     torch.save(content, checkpoints / "best.ckpt")
-    goes_on = configured(tmp_path, "trainer.max_epochs=3", f"ckpt={checkpoints}/last.ckpt", **drives)
+    resumed = configured(tmp_path, "trainer.max_epochs=3", f"ckpt={checkpoints}/last.ckpt", **drives)
     with pytest.warns(UserWarning, match=r"another way \(error\)"):
-        assert load_checkpoint(train(goes_on, data_name="boxes"))["epoch"] == 2
+        assert load_checkpoint(train(resumed, data_name="boxes"))["epoch"] == 2
 
 
-def test_maps_kept_on_the_device_train_the_same(tmp_path, capsys):
+def test_resident_maps_give_same_losses(tmp_path, capsys):
     losses = []
     for resident in ("true", "false"):
         config = configured(
@@ -211,7 +217,7 @@ def test_maps_kept_on_the_device_train_the_same(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_two_runs_from_one_seed_are_the_same(tmp_path):
+def test_same_seed_gives_same_losses(tmp_path):
     losses = []
     for name in ("a", "b"):
         config = configured(tmp_path / name, "trainer.max_epochs=1", "seed=7", frames=9)
@@ -221,7 +227,7 @@ def test_two_runs_from_one_seed_are_the_same(tmp_path):
 
 
 @pytest.mark.slow
-def test_without_ground_truth_the_fit_of_the_scans_chooses_the_best(tmp_path):
+def test_misfit_selects_best_checkpoint_without_ground_truth(tmp_path):
     config = configured(tmp_path / "run", "trainer.max_epochs=1", frames=9, without_truth=["0", "2"])
     best = train(config, data_name="boxes")
     scalars = curves(tmp_path / "run")
@@ -231,18 +237,18 @@ def test_without_ground_truth_the_fit_of_the_scans_chooses_the_best(tmp_path):
     assert "val/mean_relative_translation_error_m" not in scalars
 
 
-def test_supervised_training_without_ground_truth_says_so(tmp_path):
+def test_supervised_training_requires_ground_truth(tmp_path):
     config = configured(tmp_path / "run", "loss=supervised", frames=9, without_truth=["0"])
     with pytest.raises(UserError, match=r"needs ground truth(.|\n)*train_sequences"):
         train(config, data_name="boxes")
 
 
-def test_without_validation_the_last_checkpoint_is_what_there_is(tmp_path):
+def test_training_without_validation_returns_last_checkpoint(tmp_path):
     config = configured(tmp_path / "run", "trainer.max_epochs=1", frames=9, val_sequences=[])
     assert train(config, data_name="boxes").name == "last.ckpt"
 
 
-def test_a_training_that_stops_early_says_why(tmp_path, capsys):
+def test_early_stopping_prints_its_reason(tmp_path, capsys):
     early = [
         "+callbacks.early._target_=lightning.pytorch.callbacks.EarlyStopping", "+callbacks.early.monitor=val/error",
         "+callbacks.early.stopping_threshold=1000",
@@ -254,7 +260,7 @@ def test_a_training_that_stops_early_says_why(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_part_of_the_validation_is_scored_as_far_as_it_goes(tmp_path):
+def test_partial_validation_is_scored(tmp_path):
     config = configured(
         tmp_path / "run", "trainer.max_epochs=1", "+trainer.limit_train_batches=1", "trainer.limit_val_batches=2",
         frames=33,
@@ -264,8 +270,8 @@ def test_a_part_of_the_validation_is_scored_as_far_as_it_goes(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_training_that_has_lost_all_overlap_is_told(tmp_path):
-    """The loss is nought then, and the misfit as large as can be."""
+def test_training_without_any_overlap_warns(tmp_path):
+    """The loss is zero then, and the misfit at its maximum."""
     config = configured(
         tmp_path / "run", "trainer.max_epochs=4", "optimizer.lr=0.3", frames=17, without_truth=["0", "2"]
     )
@@ -276,7 +282,7 @@ def test_a_training_that_has_lost_all_overlap_is_told(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_image_that_scans_do_not_fill_is_told(tmp_path):
+def test_sparse_vertex_maps_warn(tmp_path):
     config = configured(
         tmp_path / "run", "trainer.max_epochs=1", "datamodule.height=32", "datamodule.width=192", frames=9
     )
@@ -285,12 +291,12 @@ def test_an_image_that_scans_do_not_fill_is_told(tmp_path):
 
 
 @pytest.mark.slow
-def test_bf16(tmp_path):
+def test_training_in_bf16(tmp_path):
     config = configured(tmp_path / "run", "trainer.max_epochs=1", "trainer.precision=bf16-mixed", frames=9)
     train(config, data_name="boxes")
     assert curves(tmp_path / "run")["train/loss_epoch"][0][1] < 1
 
 
-def test_a_loaded_network_knows_its_image_and_is_ready_to_predict(run):
+def test_loaded_module_has_projection_and_is_in_evaluation_mode(run):
     module = PoseNetModule.load_from_checkpoint(run[1])
     assert module.projection == SMALL and not module.training

@@ -1,4 +1,4 @@
-"""What a checkpoint may have built, and what not."""
+"""Building parts from plain dicts, and the targets that a checkpoint may name."""
 
 import pytest
 import torch
@@ -23,12 +23,12 @@ DATA = {
 SHELL = ["-c", "alias.x=!touch PWNED", "x"]
 
 
-def test_keys_are_the_constructor_s_arguments():
+def test_build_passes_keys_as_arguments():
     loss = build({"_target_": "lidarlearn.losses.weighted_icp.WeightedIcpLoss", "sigma_m": 0.2}, nn.Module)
     assert isinstance(loss, WeightedIcpLoss) and loss.sigma_m == 0.2
 
 
-def test_arguments_of_run_time_are_added():
+def test_build_adds_runtime_arguments():
     parameters = [torch.nn.Parameter(torch.zeros(3))]
     optimizer = build({"_target_": "torch.optim.Adam", "lr": 0.5}, Optimizer, params=parameters)
     schedule = build({"_target_": "torch.optim.lr_scheduler.StepLR", "step_size": 2}, LRScheduler, optimizer=optimizer)
@@ -42,30 +42,30 @@ def test_arguments_of_run_time_are_added():
         "builtins.eval",
         "subprocess.Popen",
         "lidarlearned.Thing",
-        "lidarlearn.data.cache.shutil.rmtree",  # reached through a module of ours
+        "lidarlearn.data.cache.shutil.rmtree",  # a module's import
         "lidarlearn.training.parts.importlib.import_module",
         "lidarlearn.commands.run_folder.subprocess.Popen",
-        "lidarlearn.data.cache.FileLock",  # imported by a module of ours
+        "lidarlearn.data.cache.FileLock",  # a module's import
         "lidarlearn.data.cache.Path",
-        "lidarlearn.commands.train.train",  # ours, but no class
-        "lidarlearn.commands.compare.GatheredResults",  # a class of ours, but none of this kind
+        "lidarlearn.commands.train.train",  # no class
+        "lidarlearn.commands.compare.GatheredResults",  # a class of another kind
         "lidarlearn.data.__main__.main",  # its import would run a command
         "torch.optim.lr_scheduler.partial",
         None,
         3,
     ],
 )
-def test_nothing_else_is_built(target):
+def test_build_refuses_untrusted_target(target):
     with pytest.raises(UserError, match=r"is refused(.|\n)*change: |does not exist"):
         build({"_target_": target}, nn.Module)
 
 
-def test_a_missing_target_is_refused():
+def test_build_refuses_missing_target():
     with pytest.raises(UntrustedTargetError):
         build({"sigma_m": 0.2}, nn.Module)
 
 
-def test_a_wrong_key_is_named_with_the_right_ones():
+def test_build_names_unknown_key_and_valid_keys():
     with pytest.raises(UserError, match=r"sigma_n(.|\n)*sigma_m, normal_window"):
         build({"_target_": "lidarlearn.losses.weighted_icp.WeightedIcpLoss", "sigma_n": 0.2}, nn.Module)
 
@@ -77,12 +77,12 @@ def test_a_wrong_key_is_named_with_the_right_ones():
         ({"_target_": "torch.optim.Adam", "lr": -1.0, "params": [PARAMETER]}, Optimizer, "learning rate"),
     ],
 )
-def test_a_value_that_is_refused_says_why(node, kind, words):
+def test_build_reports_why_value_is_invalid(node, kind, words):
     with pytest.raises(UserError, match=words):
         build(node, kind)
 
 
-def test_the_data_of_a_checkpoint_are_a_data_set_its_image_and_its_sensor():
+def test_require_trusted_accepts_data_set_projection_and_sensor():
     require_trusted(DATA, DataSet)
 
 
@@ -106,6 +106,6 @@ def test_the_data_of_a_checkpoint_are_a_data_set_its_image_and_its_sensor():
         {**DATA, "speed": torch.zeros(3)},
     ],
 )
-def test_nothing_else_is_taken_from_a_checkpoint(node):
+def test_require_trusted_refuses_other_nodes(node):
     with pytest.raises(UntrustedTargetError, match=r"is refused(.|\n)*change: "):
         require_trusted(node, DataSet)

@@ -1,4 +1,4 @@
-"""The progress bar, on a terminal and in a log file."""
+"""The progress of a training, on a terminal and in a log file."""
 
 import re
 from unittest.mock import create_autospec
@@ -38,7 +38,7 @@ def run(bar, trainer):
         bar.on_train_epoch_end(trainer, module)
 
 
-def test_in_a_log_file_one_line_an_epoch(trainer, capsys):
+def test_log_file_gets_one_line_per_epoch(trainer, capsys):
     run(ProgressLines(seconds_between_lines=1000.0), trainer)
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2
@@ -48,19 +48,19 @@ def test_in_a_log_file_one_line_an_epoch(trainer, capsys):
     assert "3.46 %" not in lines[1]  # not validated in this epoch
 
 
-def test_a_drive_that_stands_still_has_an_error_in_metres_alone(trainer, capsys):
+def test_error_without_percentage_is_printed_in_metres(trainer, capsys):
     del trainer.callback_metrics["val/avg_translation_error_percent"]
     run(ProgressLines(seconds_between_lines=1000.0), trainer)
     assert re.search(r" 100 %  loss 0\.125  relative translation error 0\.079 m  \d", capsys.readouterr().out)
 
 
-def test_a_drive_that_moves_has_it_as_a_share_of_the_motion_too(trainer, capsys):
+def test_error_is_also_printed_as_share_of_motion(trainer, capsys):
     trainer.callback_metrics["val/mean_relative_translation_error_percent"] = torch.tensor(5.43)
     run(ProgressLines(seconds_between_lines=1000.0), trainer)
     assert "  relative translation error 0.079 m  = 5.4 % of motion  " in capsys.readouterr().out
 
 
-def test_a_long_epoch_writes_lines_within(trainer, capsys):
+def test_long_epoch_prints_intermediate_lines(trainer, capsys):
     run(ProgressLines(seconds_between_lines=0.0), trainer)
     lines = capsys.readouterr().out.splitlines()
     shares = [int(re.search(r"(\d+) %", line)[1]) for line in lines]
@@ -68,37 +68,37 @@ def test_a_long_epoch_writes_lines_within(trainer, capsys):
     assert all("loss 0.5" in line for line in lines[:3])
 
 
-def test_the_loss_of_accumulated_batches_is_that_of_one(trainer, capsys):
-    trainer.accumulate_grad_batches = 4  # Lightning hands on a fourth of each
+def test_printed_loss_undoes_gradient_accumulation(trainer, capsys):
+    trainer.accumulate_grad_batches = 4  # Lightning divides each loss by four
     run(ProgressLines(seconds_between_lines=0.0), trainer)
     assert "loss 2 " in capsys.readouterr().out.splitlines()[0]
 
 
-def test_the_device_is_waited_for_only_where_a_loss_is_shown(trainer):
+def test_loss_is_read_from_device_only_when_printed(trainer):
     bar, module = ProgressLines(seconds_between_lines=1000.0), LightningModule()
     bar.on_train_start(trainer, module)
     bar.on_train_epoch_start(trainer, module)
-    with FakeTensorMode():  # whose tensors have no values to ask for
+    with FakeTensorMode():  # its tensors have no values
         for i in range(4):
             bar.on_train_batch_end(trainer, module, {"loss": torch.ones(()) * 0.5}, None, i)
 
 
-def test_on_a_terminal_the_bar_moves_in_place(trainer, capsys, monkeypatch):
+def test_terminal_gets_a_moving_bar(trainer, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     run(ProgressLines(), trainer)
     out = capsys.readouterr().out
     assert out.count("\n") == 2 and out.count("\r") >= 2
 
 
-def test_the_other_processes_of_a_run_are_silent(trainer, capsys):
+def test_disabled_progress_prints_nothing(trainer, capsys):
     bar = ProgressLines(0.0)
     bar.disable()
     run(bar, trainer)
     assert capsys.readouterr().out == ""
 
 
-def test_the_time_left_is_by_the_pace_since_this_start(trainer, capsys, monkeypatch):
-    """Of a training that goes on in its ninth epoch, too."""
+def test_remaining_time_after_resuming_uses_pace_since_start(trainer, capsys, monkeypatch):
+    """Resumed in the ninth epoch of eleven."""
     now = [0.0]
     monkeypatch.setattr("lidarlearn.training.progress.time.monotonic", lambda: now[0])
     trainer.current_epoch, trainer.max_epochs = 8, 11

@@ -1,4 +1,4 @@
-"""Lightning's remarks: which are hidden, and which are not."""
+"""Which of Lightning's messages are hidden."""
 
 import logging
 
@@ -7,7 +7,7 @@ from lightning.pytorch.profilers import SimpleProfiler
 from lidarlearn.training.quiet import quiet
 
 
-def test_a_profile_is_printed_and_a_banner_is_not(monkeypatch, caplog):
+def test_quiet_hides_banner_but_not_profile(monkeypatch, caplog):
     quiet()
     monkeypatch.setattr(logging.getLogger("lightning.pytorch"), "propagate", True)
     logging.getLogger("lightning.pytorch.trainer").info("GPU available: False")

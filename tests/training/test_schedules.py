@@ -19,18 +19,18 @@ def rates(steps, **settings):
     return seen
 
 
-def test_the_rate_rises_and_falls_to_nothing():
+def test_rate_warms_up_and_falls_to_zero():
     seen = rates(101, total_steps=100, warm_up_share=0.2)
     assert seen[0] == pytest.approx(0.2) and seen[20] == 2.0 == max(seen)
     assert seen[:21] == sorted(seen[:21]) and seen[20:] == sorted(seen[20:], reverse=True)
     assert seen[60] == pytest.approx(1.0) and seen[100] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_beyond_the_last_step_nothing_moves_any_more():
+def test_rate_is_zero_beyond_last_step():
     assert rates(8, total_steps=4, warm_up_share=0.0)[5:] == [0.0, 0.0, 0.0]
 
 
-def test_a_longer_training_goes_on_by_its_own_number_of_steps():
+def test_resumed_schedule_uses_new_number_of_steps():
     optimizer = SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
     short, long = WarmUpCosine(optimizer, 4, 0.0), WarmUpCosine(optimizer, 8, 0.0)
     for _ in range(4):
@@ -45,7 +45,7 @@ def test_a_longer_training_goes_on_by_its_own_number_of_steps():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
-def test_a_training_goes_through_it_step_by_step(tmp_path):
+def test_training_updates_cosine_schedule_every_step(tmp_path):
     from lidarlearn.commands.train import train
 
     config = configured(

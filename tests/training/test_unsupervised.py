@@ -1,4 +1,4 @@
-"""The loss of training: compiled where that is asked for and works, and the same either way."""
+"""Unsupervised training: its loss, compiled or not, and the random numbers of its processes."""
 
 import subprocess
 import sys
@@ -12,9 +12,11 @@ from lidarlearn.training.unsupervised import UnsupervisedModule
 from tests.box_world import SMALL, cast
 from tests.gpu import on_gpu
 
+pytestmark = pytest.mark.usefixtures("small_network")
+
 
 def module(**settings) -> UnsupervisedModule:
-    """Ready to train, with a network that does not matter."""
+    """Ready to train."""
     part = {"_target_": "torch.optim.SGD"}
     model = {"_target_": "lidarlearn.models.posenet.PoseNet"}
     loss = {"_target_": "lidarlearn.losses.weighted_icp.WeightedIcpLoss"}
@@ -35,7 +37,7 @@ def estimates(pairs: int = 2) -> torch.Tensor:
 
 @pytest.fixture
 def compilations(monkeypatch):
-    """How often something is compiled; it stays as it is."""
+    """The functions given to torch.compile, which returns them as they are."""
     calls = []
 
     def compile_(function, **_):
@@ -47,29 +49,29 @@ def compilations(monkeypatch):
 
 
 @pytest.mark.parametrize(("compile_loss", "times"), [("auto", 0), (False, 0), (True, 1)])
-def test_the_loss_is_compiled_once_and_on_a_cpu_only_where_that_is_asked_for(compilations, compile_loss, times):
+def test_training_loss_is_compiled_once_and_on_cpu_only_if_set(compilations, compile_loss, times):
     trained = module(compile_loss=compile_loss)
     for _ in range(3):
         trained.compute_loss(estimates(), batch())
     assert len(compilations) == times
 
 
-def test_the_loss_of_validation_is_not_compiled(compilations):
+def test_validation_loss_is_not_compiled(compilations):
     """Its batches come in several sizes."""
     validated = module(compile_loss=True).eval()
     validated.compute_loss(estimates(), batch())
     assert not compilations
 
 
-def test_what_is_compiled_is_no_part_of_a_checkpoint(compilations):
+def test_compiled_loss_is_not_in_state_dict(compilations):
     trained = module(compile_loss=True)
     before = trained.state_dict().keys()
     trained.compute_loss(estimates(), batch())
     assert trained.state_dict().keys() == before
 
 
-class _NoWayBack(torch.autograd.Function):
-    """Compiles one way only."""
+class _BrokenBackward(torch.autograd.Function):
+    """Fails in the backward pass."""
 
     @staticmethod
     def forward(ctx, x):
@@ -80,13 +82,13 @@ class _NoWayBack(torch.autograd.Function):
         raise RuntimeError("no compiler found\nand a long story why")
 
 
-@pytest.mark.parametrize("way", ["forward", "backward"])
-def test_where_compiling_fails_training_goes_on_without(monkeypatch, way):
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+def test_training_continues_without_compilation_if_it_fails(monkeypatch, direction):
     def broken(function, **_):
         def run(parameters, *others):
-            if way == "forward":
+            if direction == "forward":
                 raise RuntimeError("no compiler found\nand a long story why")
-            return function(_NoWayBack.apply(parameters), *others)
+            return function(_BrokenBackward.apply(parameters), *others)
 
         return run
 
@@ -97,12 +99,12 @@ def test_where_compiling_fails_training_goes_on_without(monkeypatch, way):
     result.loss.backward()
     assert parameters.grad.abs().sum() > 0
     assert result.loss == WeightedIcpLoss()(parameters, *batch().values(), SMALL).loss
-    trained.compute_loss(parameters, batch())  # and says so once
+    trained.compute_loss(parameters, batch())  # warns only once
 
 
 @pytest.mark.parametrize("rank", [0, 1, 2])
-def test_each_process_of_a_training_has_a_chance_of_its_own(monkeypatch, rank):
-    """All begin with that of the seed or the checkpoint; the first one keeps it, as if it were alone."""
+def test_each_process_has_its_own_random_numbers(monkeypatch, rank):
+    """All start with the same seed or checkpoint; the first keeps its state, like a single process."""
     drawn = []
     for own in (0, rank):
         monkeypatch.setattr(UnsupervisedModule, "global_rank", own)
@@ -112,7 +114,7 @@ def test_each_process_of_a_training_has_a_chance_of_its_own(monkeypatch, rank):
     assert torch.equal(*drawn) == (rank == 0)
 
 
-def test_another_word_than_auto_is_refused():
+def test_compile_loss_refuses_other_words_than_auto():
     with pytest.raises(ValueError, match="true, false or auto, got 'always'"):
         module(compile_loss="always")
 
@@ -147,18 +149,18 @@ assert counters["stats"]["unique_graphs"] == 2 and not counters["graph_break"], 
 
 
 @pytest.mark.slow
-def test_compiled_it_is_the_same_loss():
-    """In a process without checks of shapes, which do not compile."""
+def test_compiled_loss_equals_eager_loss():
+    """In a process without jaxtyping's checks, which do not compile."""
     subprocess.run([sys.executable, "-c", _COMPARISON], check=True)
 
 
 @on_gpu
-def test_a_gpu_computes_the_same_loss_and_gradient():
+def test_loss_and_gradient_on_gpu_equal_those_on_cpu():
     here, there = estimates(), estimates().detach().cuda().requires_grad_()
-    on_gpu = {key: maps.cuda() for key, maps in batch().items()}
+    batch_there = {key: maps.cuda() for key, maps in batch().items()}
     losses = [
         module().compute_loss(here, batch()).loss,
-        module(compile_loss=False).cuda().compute_loss(there, on_gpu).loss,
+        module(compile_loss=False).cuda().compute_loss(there, batch_there).loss,
     ]
     for loss in losses:
         loss.backward()
@@ -185,5 +187,5 @@ torch.testing.assert_close(pull, slow_pull, rtol=1e-2, atol=1e-2 * float(slow_pu
 
 @on_gpu
 @pytest.mark.slow
-def test_compiled_for_a_gpu_it_is_the_same_loss():
+def test_compiled_loss_on_gpu_equals_eager_loss():
     subprocess.run([sys.executable, "-c", _ON_GPU], check=True)
