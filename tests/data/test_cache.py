@@ -139,9 +139,8 @@ def test_changed_import_of_reader_makes_new_cache(tmp_path, monkeypatch):
     torch.testing.assert_close(ranges[1], ranges[0] / 2, rtol=0, atol=0.01)
 
 
-@pytest.mark.filterwarnings(
-    "ignore:This process:DeprecationWarning"
-)  # fork beside torch's threads, from Python 3.12 on
+# fork beside torch's threads, from Python 3.12 on
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_damaged_scan_error_names_file(tmp_path, num_workers):
     with pytest.raises(UserError, match=r"scan\.bin: it is truncated") as raised:
@@ -212,9 +211,8 @@ def _build(root, start, results):
     results.put((len(sequence.read), int(np.abs(maps[11].numpy()).sum())))
 
 
-@pytest.mark.filterwarnings(
-    "ignore:This process:DeprecationWarning"
-)  # fork beside torch's threads, from Python 3.12 on
+# fork beside torch's threads, from Python 3.12 on
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_concurrent_processes_project_each_scan_once(tmp_path):
     context = multiprocessing.get_context("fork")
     start, results = context.Event(), context.Queue()

@@ -155,9 +155,8 @@ def test_invalid_resident_setting_is_refused(cache_root):
         make(cache_root, resident="always")
 
 
-@pytest.mark.filterwarnings(
-    "ignore:This process:DeprecationWarning"
-)  # fork beside torch's threads, from Python 3.12 on
+# fork beside torch's threads, from Python 3.12 on
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_workers_load_equal_batches(cache_root):
     plain, loaded = make(cache_root), make(cache_root, num_workers=2)
     for a, b in zip(plain.val_dataloader()[0], loaded.val_dataloader()[0], strict=True):
