@@ -179,14 +179,8 @@ def _build(
         (folder / _DONE).unlink(missing_ok=True)  # it belonged to other maps
     maps = _opened_or_made(folder / _MAPS, shape, np.int16)
     done = _opened_or_made(folder / _DONE, shape[:1], np.bool_)
-    (folder / "settings.json").write_text(
-        json.dumps(
-            {"sequence": sequence.name, "fingerprint": sequence.fingerprint, "code": _code(sequence)}
-            | asdict(projection),
-            indent=2,
-        ),
-        encoding="utf-8",
-    )
+    settings = {"sequence": sequence.name, "fingerprint": sequence.fingerprint, "code": _code(sequence)}
+    (folder / "settings.json").write_text(json.dumps(settings | asdict(projection), indent=2), encoding="utf-8")
     missing = np.flatnonzero(~done).tolist()
     scans = DataLoader(
         _ProjectedScans(sequence, projection, missing),
