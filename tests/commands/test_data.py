@@ -7,12 +7,11 @@ import sys
 
 import pytest
 from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 
 from lidarlearn.commands.data import compose_data_set, data_groups, main
 from lidarlearn.data.sequence import DataSet
 from lidarlearn.errors import UserError
-from tests.commands.configs import composed
+from tests.data.datasets import data_set
 from tests.data.writers import (
     as_rows,
     random_points,
@@ -67,10 +66,6 @@ def error_of(capsys, *arguments):
     return printed.err.removeprefix("error: ")
 
 
-def configured(name, **settings):
-    return instantiate(composed("data", f"data={name}").data, **settings)
-
-
 @pytest.mark.parametrize("name", DATA_ON_DISK)
 def test_check_reports_missing_root(name, tmp_path, capsys):
     code, printed = run(capsys, "check", f"data={name}", f"data.root={tmp_path / 'nowhere'}")
@@ -79,21 +74,21 @@ def test_check_reports_missing_root(name, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", DATA_ON_DISK)
 def test_validation_and_test_sequences_are_disjoint(name):
-    data = configured(name)
+    data = data_set(name)
     assert isinstance(data, DataSet)
     assert not set(data.val_sequences) & set(data.test_sequences) or name in ("folder", "rosbag")
 
 
 @pytest.mark.parametrize("name", SPLITS)
 def test_kitti_splits_are_those_of_the_paper(name):
-    data = configured(name)
+    data = data_set(name)
     train, test = SPLITS[name]
     assert list(data.train_sequences) == train and list(data.test_sequences) == test
     assert set(data.val_sequences) <= set(train)
 
 
 def test_nclt_split_is_that_of_the_paper():
-    data = configured("nclt")
+    data = data_set("nclt")
     assert len(data.train_sequences) == 10
     assert (min(data.train_sequences), max(data.train_sequences)) == ("2012-01-22", "2012-03-31")
     assert data.test_sequences == ("2012-01-08",)
@@ -124,7 +119,7 @@ def test_check_accepts_whole_copy_and_names_missing_sequence(tmp_path, capsys, n
 @pytest.mark.parametrize(("name", "write", "sequence"), PUBLISHED)
 def test_check_shows_unexpected_scan_names(tmp_path, capsys, name, write, sequence):
     write(tmp_path)
-    data = configured(name, root=tmp_path, train_sequences=sequence, val_sequences=sequence, test_sequences=sequence)
+    data = data_set(name, tmp_path, sequence)
     scans = data.found()[sequence]
     for number in range(len(scans)):
         scans.path(number).rename(scans.folder / f"my_{number}{scans.path(number).suffix}")
@@ -142,7 +137,7 @@ def test_check_shows_unexpected_scan_names(tmp_path, capsys, name, write, sequen
 @pytest.mark.parametrize("count", [0, -1])
 def test_data_set_refuses_max_frames_below_one(name, count):
     with pytest.raises(InstantiationException, match=rf"data\.max_frames={count}\b.*at least 1"):
-        configured(name, max_frames=count)
+        data_set(name, max_frames=count)
 
 
 @pytest.mark.parametrize("setting", ["max_frames", "frames"])
@@ -162,7 +157,7 @@ def test_check_refuses_null_frames():
 @pytest.mark.parametrize("name", data_groups())
 def test_data_set_accepts_single_sequence_and_home_folder(name, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    data = configured(name, test_sequences="urban_07", root="~/scans")
+    data = data_set(name, test_sequences="urban_07", root="~/scans")
     assert data.test_sequences == ("urban_07",) and data.root == tmp_path / "scans"
 
 

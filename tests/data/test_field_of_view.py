@@ -2,18 +2,16 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.data import compose_data_set
 from lidarlearn.data.field_of_view import field_of_view_warning
 from lidarlearn.data.folder import Folder
 from lidarlearn.geometry.projection import SphericalProjection
 from lidarlearn.simulation import sensors
 from tests.box_world import SMALL, BoxDrives
+from tests.commands.configs import option_nodes, options
 
-PROJECTIONS = sorted(path.stem for path in (config_directory() / "projection").glob("*.yaml"))
 SENSORS = {
     "hdl64": sensors.hdl64(64),
     "hdl32": sensors.hdl32(64),
@@ -24,8 +22,7 @@ SENSORS = {
 
 
 def projection(name):
-    with initialize_config_dir(str(config_directory().absolute()), version_base="1.3"):
-        return instantiate(compose(overrides=[f"+projection={name}"]).projection)
+    return instantiate(option_nodes("data", "projection")["projection", name])
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -40,7 +37,7 @@ def test_warning_states_field_of_view_and_projections():
     remark = field_of_view_warning("drive", points, projection("hdl64"))
     assert remark is not None
     assert "44 % of the points of drive's first scan" in remark and "+3 to -24 deg" in remark
-    assert "from +21 to -21 deg" in remark and all(name in remark for name in PROJECTIONS)
+    assert "from +21 to -21 deg" in remark and all(name in remark for name in options("projection"))
 
 
 def test_sequences_warn_once(caplog):
