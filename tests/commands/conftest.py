@@ -1,36 +1,29 @@
 """Fixtures of the commands' tests."""
 
+import shutil
 import sys
 
 import numpy as np
 import pytest
-import torchvision
-from torch import nn
+from hydra._internal.hydra import Hydra
 
 from lidarlearn.commands import evaluate
 from lidarlearn.data.pose_files import write_kitti_poses
 from tests.box_world import BoxSequence
-from tests.commands.scans import FRAMES, SENSOR
+from tests.commands.networks import save_network
+from tests.commands.scans import FRAMES, on_scans
 
 
-class SmallBackbone(nn.Module):
-    """As torchvision's residual networks to PoseNet, with few parameters."""
-
-    def __init__(self, name: str, weights: None, num_classes: int) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(3, 32, kernel_size=7)  # replaced by PoseNet
-        self.conv2 = nn.Conv2d(32, 32, kernel_size=3, stride=2, padding=1)
-        self.fc = nn.Linear(32, num_classes)
-
-    def forward(self, x):
-        return self.fc(self.conv2(self.conv1(x).relu()).relu().mean(dim=(2, 3)))
+@pytest.fixture(scope="module", autouse=True)
+def use_small_network(small_network):
+    """Commands do the same with a network of any size."""
 
 
 @pytest.fixture(scope="session", autouse=True)
-def small_backbone():
-    """Training, saving and loading ResNet-18 would take most of the time, and commands do the same with any network."""
+def single_composition():
+    """Hydra composes each command line twice, at first only to read `hydra.mode`, which no config here sets."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torchvision.models, "get_model", SmallBackbone)
+        patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
         yield
 
 
@@ -48,19 +41,44 @@ def scans(tmp_path_factory):
 
 
 @pytest.fixture
+def no_plots(monkeypatch):
+    """Drawing takes longer than everything else."""
+    monkeypatch.setattr(evaluate, "figures", lambda *_: iter(()))
+
+
+@pytest.fixture
 def call(monkeypatch, capsys, scans):
-    """Runs evaluate.py on the folder; what it prints."""
+    """Runs evaluate.py on `scans` and returns its output."""
 
     def run(*arguments):
-        own = ["device=cpu", "data=folder", f"data.root={scans}", *SENSOR]
-        monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments, *own])
+        monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments, "device=cpu", *on_scans(scans)])
         evaluate.main()
         return capsys.readouterr().out
 
     return run
 
 
+@pytest.fixture(scope="session")
+def finished_run(scans, tmp_path_factory):
+    """The folder of an evaluation of two methods on both drives; tests must not write there."""
+    folder = tmp_path_factory.mktemp("evaluations") / "finished"
+    arguments = [f"hydra.run.dir={folder}", "methods=[cv+kd_f2m,ni]", "data.test_sequences=['0','1']", "device=cpu"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "figures", lambda *_: iter(()))
+        patch.setattr(sys, "argv", ["evaluate.py", *arguments, *on_scans(scans)])
+        evaluate.main()
+    return folder
+
+
 @pytest.fixture
-def no_plots(monkeypatch):
-    """Drawing takes longer than everything else."""
-    monkeypatch.setattr(evaluate, "figures", lambda *_: iter(()))
+def run_copy(finished_run, tmp_path):
+    """A copy of `finished_run`."""
+    return shutil.copytree(finished_run, tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def network(scans, tmp_path_factory):
+    """A checkpoint that was trained on both drives, as far as it tells: its weights are random."""
+    path = tmp_path_factory.mktemp("networks") / "network.ckpt"
+    save_network(path, *on_scans(scans))
+    return path

@@ -1,4 +1,4 @@
-"""`python evaluate.py` as users call it, on a folder of scans."""
+"""`python evaluate.py` and `python -m lidarlearn.evaluation`, as users call them on a folder of scans."""
 
 import json
 import shutil
@@ -10,19 +10,11 @@ import numpy as np
 import pytest
 
 from lidarlearn.commands import evaluate, evaluation
-from lidarlearn.commands.train import train
 from lidarlearn.data.cloud_files import read_cloud
 from lidarlearn.source_digest import source_digest
-from tests.commands.scans import SENSOR
-from tests.training.runs import configured
+from tests.commands.scans import on_scans
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("network") / "run"
-    return train(configured(folder, "trainer.max_epochs=1", frames=9, train_sequences=["0"]), "boxes")
 
 
 def results(folder):
@@ -33,28 +25,32 @@ def rows(folder):
     return {(row["method"], row["sequence"]): row for row in results(folder)["results"]}
 
 
-def test_a_run_is_taken_up_where_it_was_left(call, no_plots, tmp_path):
-    run = f"hydra.run.dir={tmp_path}"
-    call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']")
-    before = (tmp_path / "trajectories/cv+p_f2m/0.txt").stat().st_mtime_ns
-    printed = call(run, "methods=[cv+p_f2m,ni]", "data.test_sequences=['0','1']")
-    assert (tmp_path / "trajectories/cv+p_f2m/0.txt").stat().st_mtime_ns == before
-    assert printed.count("found in the run folder") == 1
-    assert "ni on 1: 6 scans\n" in printed and "cv+p_f2m on 0: 6 scans\n" not in printed  # what a log says at once
-    assert set(rows(tmp_path)) == {(m, s) for m in ("cv+p_f2m", "ni") for s in ("0", "1")}
+def test_evaluation_resumes_with_missing_and_interrupted_trajectories(call, no_plots, run_copy):
+    """Settings are written last: without them, an export was interrupted."""
+    trajectories = run_copy / "trajectories"
+    (trajectories / "ni" / "1.json").unlink()
+    for path in (trajectories / "cv+kd_f2m").glob("0.*"):
+        path.unlink()
+    finished = trajectories / "cv+kd_f2m" / "1.txt"
+    before = finished.stat().st_mtime_ns
+    printed = call(f"hydra.run.dir={run_copy}", "methods=[cv+kd_f2m,ni]", "data.test_sequences=['0','1']")
+    assert finished.stat().st_mtime_ns == before and printed.count("found in the run folder") == 2
+    assert "ni on 1: 6 scans\n" in printed and "cv+kd_f2m on 0: 6 scans\n" in printed  # each line appears at once
+    assert "cv+kd_f2m on 1: 6 scans\n" not in printed
+    assert set(rows(run_copy)) == {(m, s) for m in ("cv+kd_f2m", "ni") for s in ("0", "1")}
 
 
-@pytest.mark.slow
-def test_a_run_with_other_settings_is_not_taken_for_this_one(call, no_plots, tmp_path):
-    run = f"hydra.run.dir={tmp_path}"
-    call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']")
-    printed = call(run, "methods=[cv+p_f2m]", "data.test_sequences=['0']", "odometry.p_f2m.local_map.size=2")
-    assert "cv+p_f2m on 0: run again, the run folder has it with other settings (odometry)" in printed
-    settings = json.loads((tmp_path / "trajectories/cv+p_f2m/0.json").read_text())["settings"]
+def test_evaluation_runs_again_with_other_settings(call, no_plots, run_copy):
+    printed = call(
+        f"hydra.run.dir={run_copy}", "methods=[cv+kd_f2m]", "data.test_sequences=['0']",
+        "odometry.kd_f2m.local_map.size=2",
+    )  # fmt: skip
+    assert "cv+kd_f2m on 0: run again, the run folder has it with other settings (odometry)" in printed
+    settings = json.loads((run_copy / "trajectories/cv+kd_f2m/0.json").read_text())["settings"]
     assert settings["odometry"]["local_map"]["size"] == 2
 
 
-def test_a_run_of_the_user_s_own_class_is_taken_up_until_its_file_is_edited(call, no_plots, tmp_path, monkeypatch):
+def test_trajectory_of_user_class_is_reused_until_its_file_changes(call, no_plots, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     own = ["methods=[mine]", "+initialization.mine={_target_:my_initialization.Own}", "data.test_sequences=['0']"]
     printed = []
@@ -62,34 +58,25 @@ def test_a_run_of_the_user_s_own_class_is_taken_up_until_its_file_is_edited(call
         (tmp_path / "my_initialization.py").write_text(
             f"from lidarlearn.odometry.initialization import {base}\nclass Own({base}): ...\n"
         )
-        monkeypatch.delitem(sys.modules, "my_initialization", raising=False)  # as another process begins
+        monkeypatch.delitem(sys.modules, "my_initialization", raising=False)  # like a new process
         source_digest.cache_clear()
         printed.append(call(f"hydra.run.dir={tmp_path}", *own))
     assert ["found in the run folder" in text for text in printed] == [False, True, False]
     assert "mine on 0: run again, the run folder has it with other settings (code)" in printed[2]
 
 
-@pytest.mark.slow
-def test_an_export_that_was_cut_short_is_run_again(call, no_plots, tmp_path):
-    run = f"hydra.run.dir={tmp_path}"
-    call(run, "methods=[ni]", "data.test_sequences=['0']")
-    (tmp_path / "trajectories/ni/0.json").unlink()
-    assert "found" not in call(run, "methods=[ni]", "data.test_sequences=['0']")
-
-
-def test_networks_have_names_of_their_own(call, checkpoint, tmp_path):
+def test_further_network_is_a_method_of_its_name(call, no_plots, network, tmp_path):
     call(
-        f"hydra.run.dir={tmp_path}", "methods=[other,other+p_f2f]", f"+networks.other='{checkpoint}'",
+        f"hydra.run.dir={tmp_path}", "methods=[other,other+p_f2f]", f"+networks.other='{network}'",
         "data.test_sequences=['0']",
     )  # fmt: skip
     assert set(rows(tmp_path)) == {("other", "0"), ("other+p_f2f", "0")}
     protocol = results(tmp_path)["protocol"]
-    assert protocol["checkpoint"] is None and protocol["networks"]["other"]["path"] == str(checkpoint)
-    # the network was trained on sequence 0 of the same name
-    assert "*" in (tmp_path / "results.md").read_text()
+    assert protocol["checkpoint"] is None and protocol["networks"]["other"]["path"] == str(network)
+    assert "*" in (tmp_path / "results.md").read_text()  # trained on sequence 0
 
 
-def test_a_network_that_is_not_there_is_named(call, tmp_path, capsys):
+def test_network_without_path_is_named(call, tmp_path, capsys):
     with pytest.raises(SystemExit):
         call(f"hydra.run.dir={tmp_path}", "methods=[other+p_f2f]", "+networks.other=null")
     assert "networks.other=RUN/checkpoints/best.ckpt" in capsys.readouterr().err
@@ -97,7 +84,7 @@ def test_a_network_that_is_not_there_is_named(call, tmp_path, capsys):
 
 @pytest.fixture
 def no_data(monkeypatch):
-    """Where data are asked for, it is too late."""
+    """Fails as soon as the data set is built."""
     monkeypatch.setattr(evaluate, "instantiate", lambda *_, **__: 1 / 0)
 
 
@@ -108,7 +95,7 @@ def refused(capsys, *arguments):
     return capsys.readouterr().err
 
 
-def test_all_networks_that_are_not_there_are_named_before_data_are_made(no_data, tmp_path, monkeypatch, capsys):
+def test_all_missing_networks_are_named_before_data_are_built(no_data, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     error = refused(capsys, "experiment=paper/generalization_sim", "device=cpu")
     for name in ("campus", "urban"):
@@ -116,11 +103,11 @@ def test_all_networks_that_are_not_there_are_named_before_data_are_made(no_data,
         assert f"python train.py experiment=network/simulated_{name}" in error
 
 
-def test_a_checkpoint_that_nothing_uses_is_refused(no_data, checkpoint, tmp_path, capsys):
+def test_unused_checkpoint_is_refused(no_data, network, tmp_path, capsys):
     chosen = ("data=kitti_00-08", "experiment=paper/kitti")
-    error = refused(capsys, f"ckpt='{checkpoint}'", *chosen, f"hydra.run.dir={tmp_path}")
-    assert f"change: networks.posenet={checkpoint}" in error
-    error = refused(capsys, f"ckpt='{checkpoint}'", "data=folder", "methods=[cv+p_f2m]", f"hydra.run.dir={tmp_path}")
+    error = refused(capsys, f"ckpt='{network}'", *chosen, f"hydra.run.dir={tmp_path}")
+    assert f"change: networks.posenet={network}" in error
+    error = refused(capsys, f"ckpt='{network}'", "data=folder", "methods=[cv+p_f2m]", f"hydra.run.dir={tmp_path}")
     assert "no method uses this network" in error
 
 
@@ -130,41 +117,40 @@ TABLE = (
 )
 
 
-def test_the_jobs_of_a_multirun_end_in_one_table(call, no_plots, tmp_path):
-    printed = call(
-        "-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['1']", "methods=[ni],[cv+p_f2m]", TABLE
-    )
+def test_multirun_tabulates_all_jobs_but_the_failed(call, no_plots, tmp_path, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['7'],['1']", "methods=[ni]", TABLE)
+    printed = capsys.readouterr()
+    assert exit_.value.code == 1 and "error: job 1: " in printed.err
+    (group,) = results(tmp_path)["compared"]
+    assert [(row["method"], row["sequence"]) for row in group["results"]] == [("ni", "0"), ("ni", "1")]
+    assert group["averages"][0]["mean_over_sequences"]["relative_translation_error_percent"] > 99  # it stands still
+    text = (tmp_path / "results.md").read_text()
+    assert text.startswith("# Results\n\n### both") and "first" in printed.out
+
+
+@pytest.mark.slow
+def test_multirun_table_groups_rows_by_method(call, no_plots, tmp_path):
+    call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['1']", "methods=[ni],[cv+p_f2m]")
     (group,) = results(tmp_path)["compared"]
     assert [(row["method"], row["sequence"]) for row in group["results"]] == [
         ("ni", "0"), ("ni", "1"), ("cv+p_f2m", "0"), ("cv+p_f2m", "1"),
     ]  # fmt: skip
-    assert group["averages"][0]["mean_over_sequences"]["relative_translation_error_percent"] > 99  # it stands still
-    text = (tmp_path / "results.md").read_text()
-    assert text.startswith("# Results\n\n### both") and "first" in printed
 
 
-def test_a_job_that_fails_leaves_the_others_their_table(call, no_plots, tmp_path, capsys):
+def test_multirun_without_a_successful_job_has_no_table(call, no_plots, tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_:
-        call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['7'],['1']", "methods=[ni]")
-    assert exit_.value.code == 1
-    assert "error: job 1: " in capsys.readouterr().err
-    (group,) = results(tmp_path)["compared"]
-    assert [row["sequence"] for row in group["results"]] == ["0", "1"]
-
-
-def test_where_every_job_fails_each_says_why_and_no_table_is_missed(call, no_plots, tmp_path, capsys):
-    with pytest.raises(SystemExit) as exit_:
-        call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['7'],['8']", "methods=[ni]")
+        call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['7']", "methods=[ni]")
     printed = capsys.readouterr()
     assert exit_.value.code == 1 and "error: job 0: " in printed.err
     assert "IndexError" not in printed.out + printed.err and not (tmp_path / "results.md").exists()
 
 
 @pytest.mark.slow
-def test_jobs_run_in_parallel_processes(scans, tmp_path):
+def test_multirun_works_with_joblib(scans, tmp_path):
     program = Path(__file__).parents[2] / "evaluate.py"
     parallel = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}"]
-    own = ["device=cpu", "data=folder", f"data.root={scans}", *SENSOR, "methods=[ni]"]
+    own = ["device=cpu", *on_scans(scans), "methods=[ni]"]
     command = [sys.executable, str(program), *parallel, *own, "data.test_sequences=['0'],['7'],['1']"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1 and "error: job 1: " in done.stderr
@@ -173,7 +159,7 @@ def test_jobs_run_in_parallel_processes(scans, tmp_path):
 
 
 @pytest.mark.slow
-def test_compare_prints_and_writes(call, no_plots, tmp_path, monkeypatch, capsys):
+def test_compare_prints_and_writes_differing_settings(call, no_plots, tmp_path, monkeypatch, capsys):
     for name, size in (("a", 1), ("b", 2)):
         call(
             f"hydra.run.dir={tmp_path / name}", "methods=[cv+p_f2m]", "data.test_sequences=['0']",
@@ -192,8 +178,8 @@ def test_compare_prints_and_writes(call, no_plots, tmp_path, monkeypatch, capsys
 
 
 @pytest.mark.parametrize(("override", "remedy"), [("probe.every=100", "probe.every"), ("backends=[]", "p_f2m")])
-def test_a_basin_that_cannot_be_measured_is_refused(scans, tmp_path, monkeypatch, capsys, override, remedy):
-    own = ["data=folder", f"data.root={scans}", *SENSOR, "data.test_sequences=['0']", f"hydra.run.dir={tmp_path}"]
+def test_convergence_without_probes_or_backends_is_refused(scans, tmp_path, monkeypatch, capsys, override, remedy):
+    own = [*on_scans(scans), "data.test_sequences=['0']", f"hydra.run.dir={tmp_path}"]
     monkeypatch.setattr(sys, "argv", ["x", "convergence", *own, override])
     with pytest.raises(SystemExit) as exit_:
         evaluation.main()
@@ -201,10 +187,10 @@ def test_a_basin_that_cannot_be_measured_is_refused(scans, tmp_path, monkeypatch
     assert exit_.value.code == 1 and error.startswith("error: ") and remedy in error
 
 
-def test_basins_of_convergence_are_measured_and_drawn(scans, tmp_path, monkeypatch, capsys):
+def test_convergence_writes_and_draws_basins(scans, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         sys, "argv",
-        ["x", "convergence", "data=folder", f"data.root={scans}", *SENSOR, "data.test_sequences=['0']",
+        ["x", "convergence", *on_scans(scans), "data.test_sequences=['0']",
          "backends=[p_f2m,kd_f2m]", "probe.every=3", "probe.offsets_m=[0.1,20.0]", "probe.angles_deg=[1.0,170.0]",
          f"hydra.run.dir={tmp_path}"],
     )  # fmt: skip
@@ -220,7 +206,7 @@ def test_basins_of_convergence_are_measured_and_drawn(scans, tmp_path, monkeypat
 
 @pytest.fixture
 def maps_of(monkeypatch, capsys):
-    """Runs the command map; what it prints, and the error with which it gives up."""
+    """Runs the command map and returns its output and its error."""
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["x", "map", *map(str, arguments)])
@@ -234,9 +220,8 @@ def maps_of(monkeypatch, capsys):
     return run
 
 
-def test_maps_are_made_of_what_a_run_has_left(call, no_plots, maps_of, scans, tmp_path):
-    run, copy = tmp_path / "run", tmp_path / "copy"
-    call(f"hydra.run.dir={run}", "methods=[cv+kd_f2m,ni]", "data.test_sequences=['0','1']")
+def test_map_writes_clouds_pictures_and_sharpness(run_copy, maps_of, scans, tmp_path):
+    run, copy = run_copy, tmp_path / "copy"
     printed, error = maps_of(run, "--voxel", "0.5", "--sequence", "1", "--min-range=1")
     assert not error and "cv+kd_f2m" in printed and "MPV" in printed
     rows = {row["method"]: row for row in json.loads((run / "maps/maps.json").read_text())["maps"]}
@@ -246,7 +231,7 @@ def test_maps_are_made_of_what_a_run_has_left(call, no_plots, maps_of, scans, tm
     assert cloud.stat().st_size == rows["cv+kd_f2m"]["file_bytes"] and picture.is_file()
     assert len(read_cloud(cloud).points) == rows["cv+kd_f2m"]["points"]
 
-    shutil.copytree(scans, copy)  # another machine
+    shutil.copytree(scans, copy)  # as on another machine
     maps_of(run, "--method=ni", "--voxel=1", f"data.root={copy}")
     kept, *again = json.loads((run / "maps/maps.json").read_text())["maps"]
     assert kept == rows["cv+kd_f2m"] and [(row["method"], row["sequence"]) for row in again] == [
@@ -274,22 +259,21 @@ def test_maps_are_made_of_what_a_run_has_left(call, no_plots, maps_of, scans, tm
     assert "maps.json: damaged" in maps_of(run)[1]
 
 
-def test_an_interrupted_drive_gets_no_map(call, no_plots, maps_of, tmp_path):
-    call(f"hydra.run.dir={tmp_path}", "methods=[ni]", "data.test_sequences=['0']")
-    for path in sorted((tmp_path / "trajectories/ni").iterdir()):
+def test_map_refuses_interrupted_drive(run_copy, maps_of):
+    for path in sorted((run_copy / "trajectories/ni").glob("0.*")):
         path.rename(path.with_name(path.name.replace("0.", "0.partial.")))
-    error = maps_of(tmp_path)[1]
-    assert "trajectories/ni/0.partial.txt" in error and f"hydra.run.dir={tmp_path}" in error
+    error = maps_of(run_copy, "--method=ni", "--sequence=0")[1]
+    assert "trajectories/ni/0.partial.txt" in error and f"hydra.run.dir={run_copy}" in error
 
 
-def test_maps_are_made_of_runs_only_and_their_configuration_runs_no_code(maps_of, tmp_path):
+def test_map_refuses_other_folders_and_untrusted_configs(maps_of, tmp_path):
     assert "run folder of evaluate.py" in maps_of(tmp_path)[1]
     (tmp_path / "trajectories").mkdir()
     (tmp_path / "config.yaml").write_text("data:\n  _target_: os.system\n  command: 'false'\n")
     assert "os.system" in maps_of(tmp_path)[1]
 
 
-def test_other_commands_say_what_there_is(monkeypatch, capsys):
+def test_unknown_command_lists_the_commands(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["x", "comapre"])
     with pytest.raises(SystemExit) as exit_:
         evaluation.main()

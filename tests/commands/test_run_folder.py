@@ -1,4 +1,4 @@
-"""What runs leave in their folders beside the results."""
+"""The lock of a run folder, and the digest of the code behind a result."""
 
 import sys
 
@@ -10,7 +10,7 @@ from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.run_folder import code_digest, held_run_folder
 from lidarlearn.errors import UserError
 from lidarlearn.source_digest import source_digest
-from tests.commands.scans import SENSOR
+from tests.commands.scans import on_scans
 
 
 @pytest.fixture
@@ -22,30 +22,30 @@ def training(tmp_path):
     return tmp_path
 
 
-def kept(training):
+def is_unchanged(training):
     return (
         sorted(path.name for path in training.iterdir()) == ["checkpoints", "config.yaml"]
         and (training / "config.yaml").read_text() == "lr: 1\n"
     )
 
 
-def test_a_training_keeps_its_folder_to_itself(call, training, capsys):
+def test_evaluation_into_training_folder_is_refused(call, training, capsys):
     with pytest.raises(SystemExit):
         call(f"hydra.run.dir={training}", "methods=[ni]", "data.test_sequences=['0']")
     error = capsys.readouterr().err
     assert f"{training} holds a training" in error and f"hydra.run.dir={training}/evaluation" in error
-    assert kept(training)
+    assert is_unchanged(training)
 
 
-def test_basins_are_not_measured_into_a_training_either(scans, training, monkeypatch, capsys):
-    own = ["data=folder", f"data.root={scans}", *SENSOR, "data.test_sequences=['0']", f"hydra.run.dir={training}"]
+def test_convergence_into_training_folder_is_refused(scans, training, monkeypatch, capsys):
+    own = [*on_scans(scans), "data.test_sequences=['0']", f"hydra.run.dir={training}"]
     monkeypatch.setattr(sys, "argv", ["x", "convergence", *own])
     with pytest.raises(SystemExit):
         evaluation.main()
-    assert f"{training} holds a training" in capsys.readouterr().err and kept(training)
+    assert f"{training} holds a training" in capsys.readouterr().err and is_unchanged(training)
 
 
-def test_two_evaluations_do_not_write_into_one_folder_at_once(call, no_plots, tmp_path, capsys):
+def test_run_folder_is_locked_during_evaluation(call, no_plots, tmp_path, capsys):
     own = [f"hydra.run.dir={tmp_path}", "methods=[ni]", "data.test_sequences=['0']"]
     with held_run_folder(tmp_path), pytest.raises(SystemExit):
         call(*own)
@@ -56,17 +56,17 @@ def test_two_evaluations_do_not_write_into_one_folder_at_once(call, no_plots, tm
 
 
 @pytest.mark.parametrize("program", ["train", "evaluate", "convergence"])
-def test_runs_that_start_at_once_have_a_folder_each(program):
+def test_simultaneous_runs_get_different_folders(program):
     with initialize_config_dir(str(config_directory()), version_base="1.3"):
         one, two = (compose(program, return_hydra_config=True).hydra for _ in range(2))
-    folders = [one.run.dir, two.run.dir, one.sweep.dir, two.sweep.dir]  # the time is that of the first look
+    folders = [one.run.dir, two.run.dir, one.sweep.dir, two.sweep.dir]  # Hydra reads the time once, at first access
     assert folders[0] < folders[1] and folders[2] < folders[3]
     assert all(folder.startswith(f"outputs/{program}/") for folder in folders)
 
 
 @pytest.fixture
 def own_class(tmp_path, monkeypatch):
-    """A class outside of the package, whose file may be edited before it is digested again."""
+    """The file of a class outside of the package, which may be edited between digests."""
     monkeypatch.syspath_prepend(tmp_path)
     source_digest.cache_clear()
     yield tmp_path / "my_part.py"
@@ -78,7 +78,7 @@ def own_class(tmp_path, monkeypatch):
     "settings",
     [{"_target_": "my_part.Part"}, {"odometry": {"steps": [{"_target_": "my_part.Part", "size": 1}]}}],
 )
-def test_the_code_of_a_result_is_the_package_s_and_that_of_the_user_s_classes(own_class, settings):
+def test_code_digest_covers_classes_outside_the_package(own_class, settings):
     digests = []
     for size in (1, 2):
         own_class.write_text(f"class Part:\n    size = {size}\n")
@@ -87,12 +87,12 @@ def test_the_code_of_a_result_is_the_package_s_and_that_of_the_user_s_classes(ow
     assert len({*digests, code_digest()}) == 3
 
 
-def test_settings_of_the_package_alone_leave_the_code_as_it_is():
+def test_code_digest_is_that_of_the_package_for_its_own_classes():
     assert (
         code_digest({"_target_": "lidarlearn.odometry.initialization.NoInitialization"}, {"size": 1}) == code_digest()
     )
 
 
-def test_a_class_that_is_not_there_is_named():
+def test_code_digest_names_missing_class():
     with pytest.raises(UserError, match=r"my_nowhere\.Part"):
         code_digest({"_target_": "my_nowhere.Part"})

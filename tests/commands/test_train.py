@@ -48,26 +48,24 @@ def call(folder: Path, *arguments: str) -> str:
     return done.stdout + done.stderr
 
 
-def test_configs_are_found():
+def test_config_directory_holds_train_config():
     assert (config_directory() / "train.yaml").is_file()
 
 
-def test_the_revision_is_a_commit_or_unknown():
+def test_git_revision_is_a_commit_or_unknown():
     assert re.fullmatch(r"[0-9a-f]{40}(-modified)?|unknown", git_revision())
 
 
-def test_the_command_that_is_printed_knows_where_the_data_are(tmp_path, monkeypatch):
+def test_printed_command_repeats_data_overrides(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     overrides = ["data=folder", "data.root=/my scans", "trainer.max_epochs=1", "data.max_frames=9"]
-    assert (
-        command_with(tmp_path / "a.ckpt", "evaluate", overrides)
-        == "lidarlearn-evaluate ckpt=a.ckpt 'data.root=/my scans'"
-    )
-    told = command_with(tmp_path / "a.ckpt", "evaluate", overrides, is_data_stored=False)
-    assert told == "lidarlearn-evaluate ckpt=a.ckpt data=folder 'data.root=/my scans' data.max_frames=9"
+    stored = command_with(tmp_path / "a.ckpt", "evaluate", overrides)
+    assert stored == "lidarlearn-evaluate ckpt=a.ckpt 'data.root=/my scans'"
+    not_stored = command_with(tmp_path / "a.ckpt", "evaluate", overrides, is_data_stored=False)
+    assert not_stored == "lidarlearn-evaluate ckpt=a.ckpt data=folder 'data.root=/my scans' data.max_frames=9"
 
 
-def test_the_revision_is_that_of_a_clone_and_not_of_a_project_with_lidarlearn_in_its_environment(tmp_path, monkeypatch):
+def test_git_revision_ignores_repository_around_installation(tmp_path, monkeypatch):
     def git(*arguments):
         subprocess.run(
             ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *arguments], check=True
@@ -96,7 +94,7 @@ def test_the_revision_is_that_of_a_clone_and_not_of_a_project_with_lidarlearn_in
         ("runs/lr=0.1,x/best.ckpt", """'ckpt="runs/lr=0.1,x/best.ckpt"'"""),
     ],
 )
-def test_the_command_that_is_printed_survives_shell_and_hydra(path, printed, tmp_path, monkeypatch):
+def test_printed_command_quotes_for_shell_and_hydra(path, printed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert command_with(tmp_path / path, "evaluate") == f"lidarlearn-evaluate {printed}"
     assert command_with(tmp_path / path, "train") == f"lidarlearn-train {printed}"
@@ -104,20 +102,20 @@ def test_the_command_that_is_printed_survives_shell_and_hydra(path, printed, tmp
     assert command_with(tmp_path / path, "evaluate") == f"python evaluate.py {printed}"
 
 
-def test_a_later_process_takes_the_checkpoints_of_the_first_for_its_own(tmp_path, monkeypatch):
-    monkeypatch.setattr(rank_zero_only, "rank", 0)  # set by the trainer, and to be forgotten
+def test_second_process_accepts_checkpoints_of_the_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(rank_zero_only, "rank", 0)  # set by the trainer, restored after the test
     srun = {"NTASKS": 2, "NTASKS_PER_NODE": 2, "JOB_NAME": "a", "PROCID": 1, "LOCALID": 1, "NODEID": 0}
     for name, value in srun.items():
         monkeypatch.setenv(f"SLURM_{name}", str(value))
     (tmp_path / "run" / "checkpoints").mkdir(parents=True)
     (tmp_path / "run" / "checkpoints" / "last.ckpt").touch()
-    monkeypatch.setattr(train, "build_module", lambda *_: pytest.exit("came this far"))
+    monkeypatch.setattr(train, "build_module", lambda *_: pytest.exit("passed the checks"))
     config = configured(tmp_path / "run", "trainer.devices=2", "trainer.strategy=ddp")
-    with pytest.raises(pytest.exit.Exception, match="came this far"):
+    with pytest.raises(pytest.exit.Exception, match="passed the checks"):
         train.train(config, "boxes")
 
 
-def test_the_command_that_is_printed_finds_the_options_of_the_user(tmp_path, monkeypatch, capsys):
+def test_printed_command_repeats_config_dir(tmp_path, monkeypatch, capsys):
     (tmp_path / "best.ckpt").touch()
     (tmp_path / "my configs").mkdir()
     monkeypatch.setattr(train, "train", lambda *_: tmp_path / "best.ckpt")
@@ -129,7 +127,7 @@ def test_the_command_that_is_printed_finds_the_options_of_the_user(tmp_path, mon
 
 
 @pytest.mark.parametrize("events", [True, False])
-def test_curves_are_told_where_there_are_some(tmp_path, monkeypatch, capsys, events):
+def test_tensorboard_command_is_printed_only_with_events(tmp_path, monkeypatch, capsys, events):
     (tmp_path / "best.ckpt").touch()
     if events:
         (tmp_path / "run" / "version_0").mkdir(parents=True)
@@ -141,7 +139,7 @@ def test_curves_are_told_where_there_are_some(tmp_path, monkeypatch, capsys, eve
 
 
 @pytest.mark.parametrize("rank", [0, 1])
-def test_the_first_process_alone_says_what_is_next(tmp_path, monkeypatch, capsys, rank):
+def test_only_first_process_prints_next_step(tmp_path, monkeypatch, capsys, rank):
     (tmp_path / "best.ckpt").touch()
     monkeypatch.setattr(rank_zero_only, "rank", rank)
     monkeypatch.setattr(train, "train", lambda *_: tmp_path / "best.ckpt")
@@ -151,7 +149,7 @@ def test_the_first_process_alone_says_what_is_next(tmp_path, monkeypatch, capsys
 
 
 @pytest.mark.parametrize("is_saved", [True, False])
-def test_a_training_that_is_preempted_does_not_look_finished(tmp_path, monkeypatch, capsys, is_saved):
+def test_interrupted_training_exits_with_error(tmp_path, monkeypatch, capsys, is_saved):
     last = tmp_path / "run" / "checkpoints" / "last.ckpt"
 
     def interrupted(*_):
@@ -171,7 +169,7 @@ def test_a_training_that_is_preempted_does_not_look_finished(tmp_path, monkeypat
 
 
 @pytest.mark.slow
-def test_missing_data_is_one_readable_error(tmp_path):
+def test_missing_data_prints_single_error(tmp_path):
     arguments = [
         "data=kitti_00-08",
         "loss=weighted_icp",
@@ -187,7 +185,7 @@ def test_missing_data_is_one_readable_error(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_training_tells_its_progress_and_what_to_do_next(tmp_path):
+def test_training_prints_progress_and_next_step(tmp_path):
     out = call(tmp_path, "trainer.max_epochs=2")
     assert re.search(r"epoch 2/2 \[#+\] 100 %  loss [0-9.e-]+", out)
     assert "evaluate ckpt=run/checkpoints/best.ckpt" in out
@@ -195,7 +193,7 @@ def test_a_training_tells_its_progress_and_what_to_do_next(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_training_resumes_at_its_epoch(tmp_path):
+def test_killed_training_resumes_at_its_epoch(tmp_path):
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
     process = subprocess.Popen(
         command(tmp_path, "trainer.max_epochs=1000"), env=environment(), cwd=tmp_path, stdout=subprocess.DEVNULL
@@ -215,7 +213,7 @@ def test_a_killed_training_resumes_at_its_epoch(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_training_says_how_it_goes_on(tmp_path, how):
+def test_interrupted_training_prints_resume_command(tmp_path, how):
     shown = ("trainer.max_epochs=1000", "callbacks.progress.seconds_between_lines=0")
     process = subprocess.Popen(
         command(tmp_path, *shown),
@@ -231,8 +229,8 @@ def test_an_interrupted_training_says_how_it_goes_on(tmp_path, how):
     out, _ = process.communicate()
     assert process.returncode == 1
     done = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["epoch"] + 1
-    told = shlex.split(re.search(r"^go on: +lidarlearn-train (.*)$", out, re.MULTILINE)[1])
-    again = call(tmp_path, *told, f"trainer.max_epochs={done + 1}", f"hydra.run.dir={tmp_path}/resumed")
+    printed = shlex.split(re.search(r"^go on: +lidarlearn-train (.*)$", out, re.MULTILINE)[1])
+    again = call(tmp_path, *printed, f"trainer.max_epochs={done + 1}", f"hydra.run.dir={tmp_path}/resumed")
     assert re.findall(rf"epoch +(\d+)/{done + 1} .*100 %", again) == [str(done + 1)]
 
 

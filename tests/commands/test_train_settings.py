@@ -1,4 +1,4 @@
-"""Settings that do not go together are refused before data are prepared."""
+"""Settings that contradict each other are refused before data are prepared."""
 
 import pytest
 
@@ -21,7 +21,7 @@ from tests.training.runs import configured
         (["scheduler=cosin"], "choose one of step, cosine, constant"),
     ],
 )
-def test_they_say_what_to_change(tmp_path, overrides, remedy):
+def test_contradicting_settings_are_refused_with_a_remedy(tmp_path, overrides, remedy):
     with pytest.raises(UserError, match=remedy):
         train(configured(tmp_path / "run", *overrides), data_name="boxes")
 
@@ -36,5 +36,5 @@ def test_they_say_what_to_change(tmp_path, overrides, remedy):
         ["trainer.enable_checkpointing=false", "~callbacks.last_checkpoint", "~callbacks.best_checkpoint"],
     ],
 )
-def test_as_changed_they_work(tmp_path, overrides):
+def test_settings_changed_as_advised_work(tmp_path, overrides):
     train(configured(tmp_path / "run", *overrides, "trainer.max_epochs=1", frames=9), data_name="boxes")
