@@ -14,7 +14,7 @@ from lightning.pytorch import Trainer
 from omegaconf import OmegaConf
 
 from lidarlearn.commands import evaluate, train
-from lidarlearn.commands.checkpoint_options import add_data, given_checkpoint
+from lidarlearn.commands.checkpoint_options import add_data, add_to_search_path, given_checkpoint, write_option
 from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.resume import add_settings
 from lidarlearn.errors import UserError
@@ -59,6 +59,12 @@ def composed(folder: Path, checkpoint: Path, *overrides: str, program: str = "tr
         return compose(program, arguments[1:])
 
 
+@pytest.fixture(scope="module")
+def resumed_config(checkpoint, tmp_path_factory):
+    """The config of the training that resumes the checkpoint; tests change copies of it."""
+    return composed(tmp_path_factory.mktemp("options"), checkpoint)
+
+
 def user_option(tmp_path: Path, name: str, content: str) -> str:
     """Write an option into a folder of the user; the override that adds the folder to the search path."""
     place = tmp_path / "my, options" / name
@@ -67,10 +73,8 @@ def user_option(tmp_path: Path, name: str, content: str) -> str:
     return f"hydra.searchpath=['file://{tmp_path}/my, options']"
 
 
-def test_resumed_training_keeps_its_settings(checkpoint, tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARLEARN_DATA", "/elsewhere")
-    config = composed(tmp_path / "o", checkpoint)
-    assert config.data.root == "/elsewhere/folder"  # that of this machine
+def test_resumed_training_keeps_its_settings(resumed_config):
+    config = resumed_config
     assert config.data.train_sequences == ["0"] and config.data.projection.fov_up_deg == 15.0
     assert (config.datamodule.batch_size, config.datamodule.height, config.seed) == (2, 16, 7)
     assert config.loss["_target_"].endswith("IcpLoss") and config.module["_target_"].endswith("UnsupervisedModule")
@@ -101,11 +105,12 @@ def test_module_settings_are_kept_unless_overridden(checkpoint, tmp_path):
 @pytest.mark.parametrize("program", ["train", "evaluate"])
 def test_experiment_without_data_takes_them_from_checkpoint(checkpoint, tmp_path, program):
     folder = user_option(tmp_path, "experiment/seeded.yaml", "# @package _global_\nseed: 3\n")
-    overrides = [folder, "experiment=seeded"]
-    config = composed(tmp_path / "o", checkpoint, *overrides, program=program)
+    config = composed(tmp_path / "o", checkpoint, folder, "experiment=seeded", program=program)
     assert (config.seed, config.data.max_frames) == (3, FRAMES)
-    chosen = "network/simulated_mapping" if program == "train" else "paper/kitti_sim"
-    config = composed(tmp_path / "o", checkpoint, f"experiment={chosen}", program=program)
+
+
+def test_experiment_with_data_overrides_those_of_checkpoint(checkpoint, tmp_path):
+    config = composed(tmp_path / "o", checkpoint, "experiment=paper/kitti_sim", program="evaluate")
     assert config.data["_target_"].endswith("SimulatedDataSet")
 
 
@@ -150,19 +155,19 @@ def test_command_line_and_experiment_override_checkpoint(checkpoint, tmp_path):
     assert config.loss["_target_"].endswith("WeightedIcpLoss")
 
 
-@pytest.mark.parametrize("folder", ["t m,p", "t=(1)", "John Doe's", 'a"b', "a\\b\\", "[x]{y: z}", "é"])
-def test_temporary_folder_may_have_any_name(checkpoint, tmp_path, folder):
-    assert composed(tmp_path / folder, checkpoint).data.max_frames == FRAMES
+@pytest.mark.parametrize("name", ["t m,p", "t=(1)", "John Doe's", 'a"b', "a\\b\\", "[x]{y: z}", "é"])
+def test_temporary_folder_may_have_any_name(tmp_path, name):
+    write_option(tmp_path / name, "data", {"defaults": ["folder@_here_", "_self_"], "max_frames": FRAMES})
+    arguments = ["ckpt=a.ckpt"]
+    add_to_search_path(arguments, tmp_path / name, "data=checkpoint")
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        assert compose("data", arguments[1:]).data.max_frames == FRAMES
 
 
-@pytest.mark.parametrize("program", ["train", "evaluate"])
-def test_search_path_of_the_user_is_kept(checkpoint, tmp_path, program):
+def test_search_path_of_the_user_is_kept(checkpoint, tmp_path):
     folder = user_option(tmp_path, "projection/mine.yaml", "defaults: [hdl64@_here_, _self_]\nheight: 17\n")
-    overrides = [folder, "projection@data.projection=mine"]
-    config = composed(tmp_path / "o", checkpoint, *overrides, "data=folder", program=program)
+    config = composed(tmp_path / "o", checkpoint, folder, "projection@data.projection=mine", "data=folder")
     assert config.data.projection.height == 17
-    config = composed(tmp_path / "o", checkpoint, overrides[0], program=program)
-    assert config.data.max_frames == FRAMES
 
 
 @pytest.mark.parametrize(("program", "remedy"), [("train", "one at a time$"), ("evaluate", r"add data=\.\.\.$")])
@@ -189,22 +194,23 @@ def test_slurm_launcher_is_refused(checkpoint, tmp_path, program):
 
 
 @pytest.mark.parametrize(
-    ("override", "words"),
+    ("setting", "message"),
     [
         ("optimizer.lr=1e-5", r"another optimizer: lr was 0\.001 and is 1e-05"),
-        ("optimizer=adam", r"another optimizer: _target_ was torch\.optim\.AdamW"),
+        ("optimizer._target_=torch.optim.Adam", r"another optimizer: _target_ was torch\.optim\.AdamW"),
         ("schedulers.step.milestones=[1,2]", r"another scheduler: milestones was \[1\]"),
         ("scheduler=cosine", "another scheduler"),
         ("schedulers.step.gamma=0.1", "another scheduler: gamma"),
-        ("loss=weighted_icp", "another loss: _target_"),
+        ("loss._target_=lidarlearn.losses.weighted_icp.WeightedIcpLoss", "another loss: _target_"),
         ("model.backbone=resnet34", "another model: backbone"),
         ("trainer.max_epochs=2", r"2 of 2 epochs\n  change: trainer\.max_epochs=4"),
     ],
 )
-def test_resuming_refuses_other_parts_and_finished_training(checkpoint, tmp_path, override, words):
-    config = composed(tmp_path / "o", checkpoint, override)
+def test_resuming_refuses_other_parts_and_finished_training(checkpoint, resumed_config, setting, message):
+    config = resumed_config.copy()
+    config.merge_with_dotlist([setting])
     module = train.build_module(config, instantiate(config.datamodule), "folder")
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(UserError, match=message):
         require_resumable(checkpoint, module, Trainer(accelerator="cpu", max_epochs=config.trainer.max_epochs))
 
 
