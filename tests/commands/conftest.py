@@ -11,7 +11,7 @@ from lidarlearn.commands import evaluate
 from lidarlearn.data.pose_files import write_kitti_poses
 from tests.box_world import BoxSequence
 from tests.commands.networks import save_network
-from tests.commands.scans import FRAMES, on_scans
+from tests.commands.scans import FRAMES, evaluate_scans, on_scans
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -40,10 +40,12 @@ def scans(tmp_path_factory):
     return root
 
 
-@pytest.fixture
-def no_plots(monkeypatch):
+@pytest.fixture(scope="session", autouse=True)
+def no_plots():
     """Drawing takes longer than everything else."""
-    monkeypatch.setattr(evaluate, "figures", lambda *_: iter(()))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "figures", lambda *_: iter(()))
+        yield
 
 
 @pytest.fixture
@@ -62,11 +64,7 @@ def call(monkeypatch, capsys, scans):
 def finished_run(scans, tmp_path_factory):
     """The folder of an evaluation of two methods on both drives; tests must not write there."""
     folder = tmp_path_factory.mktemp("evaluations") / "finished"
-    arguments = [f"hydra.run.dir={folder}", "methods=[cv+kd_f2m,ni]", "data.test_sequences=['0','1']", "device=cpu"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluate, "figures", lambda *_: iter(()))
-        patch.setattr(sys, "argv", ["evaluate.py", *arguments, *on_scans(scans)])
-        evaluate.main()
+    evaluate_scans(scans, folder, "methods=[cv+kd_f2m,ni]")
     return folder
 
 

@@ -1,6 +1,9 @@
-"""Command lines on the folder of the fixture `scans`."""
+"""Command lines and evaluations on the folder of the fixture `scans`."""
 
 from pathlib import Path
+
+from lidarlearn.commands.evaluate import evaluate
+from tests.commands.configs import composed
 
 FRAMES = 6
 SENSOR = [
@@ -12,3 +15,10 @@ SENSOR = [
 def on_scans(scans: Path) -> list[str]:
     """The overrides that choose these scans."""
     return ["data=folder", f"data.root={scans}", *SENSOR]
+
+
+def evaluate_scans(scans: Path, run_dir: Path, *settings: str) -> None:
+    """Evaluate as `evaluate.py SETTINGS` does, with settings merged into a config that is composed once."""
+    config = composed("evaluate", "device=cpu", *on_scans(scans))
+    config.merge_with_dotlist([f"run_dir={run_dir}", *settings])
+    evaluate(config, "folder")

@@ -12,7 +12,7 @@ import pytest
 from lidarlearn.commands import evaluate, evaluation
 from lidarlearn.data.cloud_files import read_cloud
 from lidarlearn.source_digest import source_digest
-from tests.commands.scans import on_scans
+from tests.commands.scans import evaluate_scans, on_scans
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
 
@@ -25,7 +25,7 @@ def rows(folder):
     return {(row["method"], row["sequence"]): row for row in results(folder)["results"]}
 
 
-def test_evaluation_resumes_with_missing_and_interrupted_trajectories(call, no_plots, run_copy):
+def test_evaluation_resumes_with_missing_and_interrupted_trajectories(scans, run_copy, capsys):
     """Settings are written last: without them, an export was interrupted."""
     trajectories = run_copy / "trajectories"
     (trajectories / "ni" / "1.json").unlink()
@@ -33,26 +33,26 @@ def test_evaluation_resumes_with_missing_and_interrupted_trajectories(call, no_p
         path.unlink()
     finished = trajectories / "cv+kd_f2m" / "1.txt"
     before = finished.stat().st_mtime_ns
-    printed = call(f"hydra.run.dir={run_copy}", "methods=[cv+kd_f2m,ni]", "data.test_sequences=['0','1']")
+    evaluate_scans(scans, run_copy, "methods=[cv+kd_f2m,ni]")
+    printed = capsys.readouterr().out
     assert finished.stat().st_mtime_ns == before and printed.count("found in the run folder") == 2
     assert "ni on 1: 6 scans\n" in printed and "cv+kd_f2m on 0: 6 scans\n" in printed  # each line appears at once
     assert "cv+kd_f2m on 1: 6 scans\n" not in printed
     assert set(rows(run_copy)) == {(m, s) for m in ("cv+kd_f2m", "ni") for s in ("0", "1")}
 
 
-def test_evaluation_runs_again_with_other_settings(call, no_plots, run_copy):
-    printed = call(
-        f"hydra.run.dir={run_copy}", "methods=[cv+kd_f2m]", "data.test_sequences=['0']",
-        "odometry.kd_f2m.local_map.size=2",
-    )  # fmt: skip
+def test_evaluation_runs_again_with_other_settings(scans, run_copy, capsys):
+    changed = ["methods=[cv+kd_f2m]", "data.test_sequences=['0']", "odometry.kd_f2m.local_map.size=2"]
+    evaluate_scans(scans, run_copy, *changed)
+    printed = capsys.readouterr().out
     assert "cv+kd_f2m on 0: run again, the run folder has it with other settings (odometry)" in printed
     settings = json.loads((run_copy / "trajectories/cv+kd_f2m/0.json").read_text())["settings"]
     assert settings["odometry"]["local_map"]["size"] == 2
 
 
-def test_trajectory_of_user_class_is_reused_until_its_file_changes(call, no_plots, tmp_path, monkeypatch):
+def test_trajectory_of_user_class_is_reused_until_its_file_changes(scans, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(tmp_path)
-    own = ["methods=[mine]", "+initialization.mine={_target_:my_initialization.Own}", "data.test_sequences=['0']"]
+    own = ["methods=[mine]", "initialization.mine={_target_: my_initialization.Own}", "data.test_sequences=['0']"]
     printed = []
     for base in ("NoInitialization", "NoInitialization", "ConstantVelocity"):
         (tmp_path / "my_initialization.py").write_text(
@@ -60,16 +60,16 @@ def test_trajectory_of_user_class_is_reused_until_its_file_changes(call, no_plot
         )
         monkeypatch.delitem(sys.modules, "my_initialization", raising=False)  # like a new process
         source_digest.cache_clear()
-        printed.append(call(f"hydra.run.dir={tmp_path}", *own))
+        evaluate_scans(scans, tmp_path, *own)
+        printed.append(capsys.readouterr().out)
     assert ["found in the run folder" in text for text in printed] == [False, True, False]
     assert "mine on 0: run again, the run folder has it with other settings (code)" in printed[2]
 
 
-def test_further_network_is_a_method_of_its_name(call, no_plots, network, tmp_path):
-    call(
-        f"hydra.run.dir={tmp_path}", "methods=[other,other+p_f2f]", f"+networks.other='{network}'",
-        "data.test_sequences=['0']",
-    )  # fmt: skip
+def test_further_network_is_a_method_of_its_name(scans, network, tmp_path):
+    evaluate_scans(
+        scans, tmp_path, "methods=[other,other+p_f2f]", f"networks.other={network}", "data.test_sequences=['0']"
+    )
     assert set(rows(tmp_path)) == {("other", "0"), ("other+p_f2f", "0")}
     protocol = results(tmp_path)["protocol"]
     assert protocol["checkpoint"] is None and protocol["networks"]["other"]["path"] == str(network)
@@ -117,7 +117,7 @@ TABLE = (
 )
 
 
-def test_multirun_tabulates_all_jobs_but_the_failed(call, no_plots, tmp_path, capsys):
+def test_multirun_tabulates_all_jobs_but_the_failed(call, tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_:
         call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['7'],['1']", "methods=[ni]", TABLE)
     printed = capsys.readouterr()
@@ -130,7 +130,7 @@ def test_multirun_tabulates_all_jobs_but_the_failed(call, no_plots, tmp_path, ca
 
 
 @pytest.mark.slow
-def test_multirun_table_groups_rows_by_method(call, no_plots, tmp_path):
+def test_multirun_table_groups_rows_by_method(call, tmp_path):
     call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['0'],['1']", "methods=[ni],[cv+p_f2m]")
     (group,) = results(tmp_path)["compared"]
     assert [(row["method"], row["sequence"]) for row in group["results"]] == [
@@ -138,7 +138,7 @@ def test_multirun_table_groups_rows_by_method(call, no_plots, tmp_path):
     ]  # fmt: skip
 
 
-def test_multirun_without_a_successful_job_has_no_table(call, no_plots, tmp_path, capsys):
+def test_multirun_without_a_successful_job_has_no_table(call, tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_:
         call("-m", f"hydra.sweep.dir={tmp_path}", "data.test_sequences=['7']", "methods=[ni]")
     printed = capsys.readouterr()
@@ -159,7 +159,7 @@ def test_multirun_works_with_joblib(scans, tmp_path):
 
 
 @pytest.mark.slow
-def test_compare_prints_and_writes_differing_settings(call, no_plots, tmp_path, monkeypatch, capsys):
+def test_compare_prints_and_writes_differing_settings(call, tmp_path, monkeypatch, capsys):
     for name, size in (("a", 1), ("b", 2)):
         call(
             f"hydra.run.dir={tmp_path / name}", "methods=[cv+p_f2m]", "data.test_sequences=['0']",

@@ -7,10 +7,12 @@ import torch
 
 from lidarlearn.commands.evaluate import configured_method
 from lidarlearn.commands.protocol import ground_truth_digest, method_settings
+from lidarlearn.errors import UserError
 from lidarlearn.geometry import se3
 from tests.box_world import BoxSequence
 from tests.commands.configs import composed
 from tests.commands.networks import save_network
+from tests.commands.scans import evaluate_scans
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
 
@@ -28,16 +30,14 @@ def foreign(scans, tmp_path):
     return folder
 
 
-def test_protocol_names_scored_files_and_their_frame(call, no_plots, foreign, tmp_path):
-    call(f"hydra.run.dir={tmp_path / 'run'}", f"trajectories={foreign}", "data.test_sequences=['0']")
+def test_protocol_names_scored_files_and_their_frame(scans, foreign, tmp_path):
+    evaluate_scans(scans, tmp_path / "run", f"trajectories={foreign}", "data.test_sequences=['0']")
     assert protocol(tmp_path / "run")["trajectories"] == {"path": str(foreign), "frame": "lidar"}
 
 
-def test_trajectories_together_with_methods_are_refused(call, foreign, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        call(f"hydra.run.dir={tmp_path / 'run'}", f"trajectories={foreign}", "methods=[ei+kd_f2m]")
-    error = capsys.readouterr().err
-    assert str(foreign) in error and "ei+kd_f2m" in error and "methods=null" in error
+def test_trajectories_together_with_methods_are_refused(scans, foreign, tmp_path):
+    with pytest.raises(UserError, match=rf"{foreign}.*ei\+kd_f2m(.|\n)*methods=null"):
+        evaluate_scans(scans, tmp_path / "run", f"trajectories={foreign}", "methods=[ei+kd_f2m]")
 
 
 def test_checkpoint_names_sequences_as_its_data_set_does(network, tmp_path):
@@ -47,8 +47,8 @@ def test_checkpoint_names_sequences_as_its_data_set_does(network, tmp_path):
     assert in_folder == ["0", "1"]  # all, since `data.train_sequences` is null
 
 
-def test_protocol_names_training_sequences_of_checkpoint(call, no_plots, network, tmp_path):
-    call(f"hydra.run.dir={tmp_path}", f"ckpt={network}", "methods=[posenet]", "data.test_sequences=['1']")
+def test_protocol_names_training_sequences_of_checkpoint(scans, network, tmp_path):
+    evaluate_scans(scans, tmp_path, f"ckpt={network}", "methods=[posenet]", "data.test_sequences=['1']")
     assert protocol(tmp_path)["checkpoint"]["trained_on"]["train_sequences"] == ["0", "1"]
     assert "*: the network was trained on this sequence" in (tmp_path / "results.md").read_text()
 

@@ -3,13 +3,12 @@
 import sys
 
 import pytest
-from hydra import compose, initialize_config_dir
 
 from lidarlearn.commands import evaluation
-from lidarlearn.commands.configs import config_directory
 from lidarlearn.commands.run_folder import code_digest, held_run_folder
 from lidarlearn.errors import UserError
 from lidarlearn.source_digest import source_digest
+from tests.commands.configs import composed_with_hydra
 from tests.commands.scans import on_scans
 
 
@@ -45,7 +44,7 @@ def test_convergence_into_training_folder_is_refused(scans, training, monkeypatc
     assert f"{training} holds a training" in capsys.readouterr().err and is_unchanged(training)
 
 
-def test_run_folder_is_locked_during_evaluation(call, no_plots, tmp_path, capsys):
+def test_run_folder_is_locked_during_evaluation(call, tmp_path, capsys):
     own = [f"hydra.run.dir={tmp_path}", "methods=[ni]", "data.test_sequences=['0']"]
     with held_run_folder(tmp_path), pytest.raises(SystemExit):
         call(*own)
@@ -57,8 +56,7 @@ def test_run_folder_is_locked_during_evaluation(call, no_plots, tmp_path, capsys
 
 @pytest.mark.parametrize("program", ["train", "evaluate", "convergence"])
 def test_simultaneous_runs_get_different_folders(program):
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        one, two = (compose(program, return_hydra_config=True).hydra for _ in range(2))
+    one, two = composed_with_hydra(program).hydra, composed_with_hydra.__wrapped__(program).hydra  # the latter anew
     folders = [one.run.dir, two.run.dir, one.sweep.dir, two.sweep.dir]  # Hydra reads the time once, at first access
     assert folders[0] < folders[1] and folders[2] < folders[3]
     assert all(folder.startswith(f"outputs/{program}/") for folder in folders)
