@@ -13,7 +13,6 @@ from lidarlearn.odometry.sampling import GridSampling, ImageSampling
 from lidarlearn.registration.association import KdTree, Projective, VoxelHash
 from lidarlearn.registration.elasticity import Elasticity
 from lidarlearn.registration.gauss_newton import GaussNewton
-from lidarlearn.registration.weights import Proximity
 
 
 def kd_f2m(projection: SphericalProjection, size: int = 30, device: torch.device | str = "cpu") -> Backend:
@@ -49,7 +48,7 @@ def p_f2m(projection: SphericalProjection, size: int = 30, device: torch.device 
     return Backend(
         ImageSampling(projection),
         LocalMap(Projective(projection, device, image_distance_m=2.0), size),
-        GaussNewton(weight=Proximity(), elasticity=Elasticity(points_per_measurement=100.0)),
+        GaussNewton(elasticity=Elasticity(points_per_measurement=100.0)),
     )
 
 
