@@ -22,9 +22,8 @@ def test_map_figure_places_heights(make_drive):
     assert axes.lines[1].get_linestyle() == "--" and "[m]" in figure.axes[1].get_ylabel()
 
 
-@pytest.mark.parametrize("name", ["测试 数据", "a$b_{c$d"], ids=["cjk", "math"])
-def test_map_figure_accepts_any_name(make_drive, name):
-    figure, _, _ = picture(torch.ones(1, 3), make_drive(5), name=name)
+def test_map_figure_accepts_any_name(make_drive):
+    figure, _, _ = picture(torch.ones(1, 3), make_drive(5), name="测试 a$b_{c$d")
     figure.draw_without_rendering()
 
 

@@ -125,13 +125,13 @@ def test_figures_of_evaluation_are_written_as_png(tmp_path, make_sequence, longe
         "trajectories_unknown",
     ]
     for name, figure in drawn.items():
-        figure.savefig(tmp_path / f"{name}.png")
+        figure.savefig(tmp_path / f"{name}.png", dpi=40)
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("name", ["测试 数据", "a$b_{c$d"], ids=["cjk", "math"])
-def test_figures_accept_any_name(make_sequence, name):
+def test_figures_accept_any_name(make_sequence):
     """Letters without a font do not warn, and formulas are not parsed."""
+    name = "测试 a$b_{c$d"
     sequence = make_sequence(name, 150)
     estimates = {name: {name: sequence.T_world_lidar}}
     scores = [score(name, sequence.T_world_lidar, sequence)]

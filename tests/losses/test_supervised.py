@@ -39,8 +39,8 @@ def test_gradients_of_estimates_and_weights():
 def test_learned_weights_converge_to_precisions():
     truth, estimate = motions(50), motions(50, seed=1)
     loss = SupervisedLoss().double()
-    optimizer = torch.optim.Adam(loss.parameters(), lr=0.05)
-    for _ in range(400):
+    optimizer = torch.optim.Adam(loss.parameters(), lr=0.2)
+    for _ in range(120):
         optimizer.zero_grad()
         result = loss(estimate, se3.from_euler(truth))
         result.loss.backward()

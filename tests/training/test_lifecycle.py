@@ -155,8 +155,9 @@ def resume_worse(folder, ended, run_dir, loss, **drives):
     copied.mkdir()
     torch.save(content, copied / "last.ckpt")
     (copied / "best.ckpt").write_bytes((folder / "checkpoints" / "best.ckpt").read_bytes())
-    settings = (f"loss={loss}", f"trainer.max_epochs={EPOCHS + 1}", f"ckpt={copied}/last.ckpt")
-    return load_checkpoint(train(configured(run_dir, *settings, frames=FRAMES, **drives), data_name="boxes"))
+    epoch = (f"trainer.max_epochs={EPOCHS + 1}", "+trainer.limit_train_batches=2")
+    config = configured(run_dir, f"loss={loss}", f"ckpt={copied}/last.ckpt", *epoch, frames=FRAMES, **drives)
+    return load_checkpoint(train(config, data_name="boxes"))
 
 
 def test_resuming_keeps_best_checkpoint_if_later_epochs_are_worse(run, tmp_path):
