@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from omegaconf import DictConfig
+
 from lidarlearn.commands.evaluate import evaluate
 from tests.commands.configs import composed
 
@@ -17,8 +19,13 @@ def on_scans(scans: Path) -> list[str]:
     return ["data=folder", f"data.root={scans}", *SENSOR]
 
 
-def evaluate_scans(scans: Path, run_dir: Path, *settings: str) -> None:
-    """Evaluate as `evaluate.py SETTINGS` does, with settings merged into a config that is composed once."""
-    config = composed("evaluate", "device=cpu", *on_scans(scans))
+def configured(program: str, scans: Path, run_dir: Path, *settings: str) -> DictConfig:
+    """The config of a program on these scans; settings are merged into a config that is composed once."""
+    config = composed(program, "device=cpu", *on_scans(scans))
     config.merge_with_dotlist([f"run_dir={run_dir}", *settings])
-    evaluate(config, "folder")
+    return config
+
+
+def evaluate_scans(scans: Path, run_dir: Path, *settings: str) -> None:
+    """Evaluate as `evaluate.py SETTINGS` does."""
+    evaluate(configured("evaluate", scans, run_dir, *settings), "folder")

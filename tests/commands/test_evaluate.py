@@ -11,8 +11,10 @@ import pytest
 
 from lidarlearn.commands import evaluate, evaluation
 from lidarlearn.data.cloud_files import read_cloud
+from lidarlearn.errors import UserError
 from lidarlearn.source_digest import source_digest
-from tests.commands.scans import evaluate_scans, on_scans
+from tests.commands.configs import composed
+from tests.commands.scans import configured, evaluate_scans, on_scans
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorboard")
 
@@ -76,10 +78,9 @@ def test_further_network_is_a_method_of_its_name(scans, network, tmp_path):
     assert "*" in (tmp_path / "results.md").read_text()  # trained on sequence 0
 
 
-def test_network_without_path_is_named(call, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        call(f"hydra.run.dir={tmp_path}", "methods=[other+p_f2f]", "+networks.other=null")
-    assert "networks.other=RUN/checkpoints/best.ckpt" in capsys.readouterr().err
+def test_network_without_path_is_named(scans, tmp_path):
+    with pytest.raises(UserError, match=r"networks\.other=RUN/checkpoints/best\.ckpt"):
+        evaluate_scans(scans, tmp_path, "methods=[other+p_f2f]", "networks.other=null")
 
 
 @pytest.fixture
@@ -88,27 +89,22 @@ def no_data(monkeypatch):
     monkeypatch.setattr(evaluate, "instantiate", lambda *_, **__: 1 / 0)
 
 
-def refused(capsys, *arguments):
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
-        patch.setattr(sys, "argv", ["evaluate.py", *arguments])
-        evaluate.main()
-    return capsys.readouterr().err
-
-
-def test_all_missing_networks_are_named_before_data_are_built(no_data, tmp_path, monkeypatch, capsys):
+def test_all_missing_networks_are_named_before_data_are_built(no_data, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    error = refused(capsys, "experiment=paper/generalization_sim", "device=cpu")
+    with pytest.raises(UserError) as error:
+        evaluate.evaluate(composed("evaluate", "experiment=paper/generalization_sim"), "simulated_urban")
     for name in ("campus", "urban"):
-        assert f"networks.posenet_{name}: no file outputs/network/simulated_{name}/checkpoints/best.ckpt" in error
-        assert f"python train.py experiment=network/simulated_{name}" in error
+        missing = f"networks.posenet_{name}: no file outputs/network/simulated_{name}/checkpoints/best.ckpt"
+        assert missing in str(error.value)
+        assert f"python train.py experiment=network/simulated_{name}" in str(error.value)
 
 
-def test_unused_checkpoint_is_refused(no_data, network, tmp_path, capsys):
-    chosen = ("data=kitti_00-08", "experiment=paper/kitti")
-    error = refused(capsys, f"ckpt='{network}'", *chosen, f"hydra.run.dir={tmp_path}")
-    assert f"change: networks.posenet={network}" in error
-    error = refused(capsys, f"ckpt='{network}'", "data=folder", "methods=[cv+p_f2m]", f"hydra.run.dir={tmp_path}")
-    assert "no method uses this network" in error
+@pytest.mark.parametrize("methods", ["experiment=paper/kitti", "methods=[cv+p_f2m]"])
+def test_unused_checkpoint_is_refused(no_data, call, network, tmp_path, capsys, methods):
+    with pytest.raises(SystemExit):
+        call(f"ckpt='{network}'", methods, f"hydra.run.dir={tmp_path}")
+    error = capsys.readouterr().err
+    assert "no method uses this network" in error and f"change: networks.posenet={network}" in error
 
 
 TABLE = (
@@ -177,21 +173,19 @@ def test_compare_prints_and_writes_differing_settings(call, tmp_path, monkeypatc
     assert exit_.value.code == 1 and "results.json: no such file" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("override", "remedy"), [("probe.every=100", "probe.every"), ("backends=[]", "p_f2m")])
-def test_convergence_without_probes_or_backends_is_refused(scans, tmp_path, monkeypatch, capsys, override, remedy):
-    own = [*on_scans(scans), "data.test_sequences=['0']", f"hydra.run.dir={tmp_path}"]
-    monkeypatch.setattr(sys, "argv", ["x", "convergence", *own, override])
-    with pytest.raises(SystemExit) as exit_:
-        evaluation.main()
-    error = capsys.readouterr().err
-    assert exit_.value.code == 1 and error.startswith("error: ") and remedy in error
+@pytest.mark.parametrize(("setting", "remedy"), [("probe.every=100", r"probe\.every"), ("backends=[]", "p_f2m")])
+def test_convergence_without_probes_or_backends_is_refused(scans, tmp_path, setting, remedy):
+    config = configured("convergence", scans, tmp_path, "data.test_sequences=['0']", setting)
+    with pytest.raises(UserError, match=remedy):
+        evaluation.measure_convergence(config)
 
 
 def test_convergence_writes_and_draws_basins(scans, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         sys, "argv",
         ["x", "convergence", *on_scans(scans), "data.test_sequences=['0']",
-         "backends=[p_f2m,kd_f2m]", "probe.every=3", "probe.offsets_m=[0.1,20.0]", "probe.angles_deg=[1.0,170.0]",
+         "backends=[p_f2m,kd_f2m]", "probe.every=5", "probe.directions=4",
+         "probe.offsets_m=[0.1,20.0]", "probe.angles_deg=[1.0,170.0]",
          f"hydra.run.dir={tmp_path}"],
     )  # fmt: skip
     evaluation.main()

@@ -9,7 +9,7 @@ from lidarlearn.commands.run_folder import code_digest, held_run_folder
 from lidarlearn.errors import UserError
 from lidarlearn.source_digest import source_digest
 from tests.commands.configs import composed_with_hydra
-from tests.commands.scans import on_scans
+from tests.commands.scans import configured
 
 
 @pytest.fixture
@@ -36,22 +36,19 @@ def test_evaluation_into_training_folder_is_refused(call, training, capsys):
     assert is_unchanged(training)
 
 
-def test_convergence_into_training_folder_is_refused(scans, training, monkeypatch, capsys):
-    own = [*on_scans(scans), "data.test_sequences=['0']", f"hydra.run.dir={training}"]
-    monkeypatch.setattr(sys, "argv", ["x", "convergence", *own])
-    with pytest.raises(SystemExit):
-        evaluation.main()
-    assert f"{training} holds a training" in capsys.readouterr().err and is_unchanged(training)
+def test_convergence_into_training_folder_is_refused(scans, training):
+    with pytest.raises(UserError, match=f"{training} holds a training"):
+        evaluation.measure_convergence(configured("convergence", scans, training))
+    assert is_unchanged(training)
 
 
 def test_run_folder_is_locked_during_evaluation(call, tmp_path, capsys):
-    own = [f"hydra.run.dir={tmp_path}", "methods=[ni]", "data.test_sequences=['0']"]
     with held_run_folder(tmp_path), pytest.raises(SystemExit):
-        call(*own)
+        call(f"hydra.run.dir={tmp_path}", "methods=[ni]")
     error = capsys.readouterr().err
     assert f"{tmp_path}: another process writes its results there" in error and "hydra.run.dir=" in error
-    call(*own)
-    assert (tmp_path / "results.json").is_file()
+    with held_run_folder(tmp_path):
+        assert not (tmp_path / "results.json").exists()
 
 
 @pytest.mark.parametrize("program", ["train", "evaluate", "convergence"])
