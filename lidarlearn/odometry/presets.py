@@ -11,7 +11,6 @@ from lidarlearn.odometry.beam_spacing import map_voxel_m, search_distance_m
 from lidarlearn.odometry.local_map import LocalMap
 from lidarlearn.odometry.sampling import GridSampling, ImageSampling
 from lidarlearn.registration.association import KdTree, Projective, VoxelHash
-from lidarlearn.registration.elasticity import Elasticity
 from lidarlearn.registration.gauss_newton import GaussNewton
 
 
@@ -45,11 +44,7 @@ def p_f2m(projection: SphericalProjection, size: int = 30, device: torch.device 
         size: number of scans in the map.
         device: where the map is kept and searched.
     """
-    return Backend(
-        ImageSampling(projection),
-        LocalMap(Projective(projection, device, image_distance_m=2.0), size),
-        GaussNewton(elasticity=Elasticity(points_per_measurement=100.0)),
-    )
+    return Backend(ImageSampling(projection), LocalMap(Projective(projection, device, image_distance_m=2.0), size))
 
 
 def _on_a_grid(association: KdTree | VoxelHash, projection: SphericalProjection, size: int) -> Backend:
