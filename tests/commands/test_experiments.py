@@ -42,6 +42,7 @@ def test_network_resolves_and_its_name_tells_the_loss(name):
     assert ("Supervised" in config["loss"]["_target_"]) == ("supervised" in name)
 
 
+@pytest.mark.slow
 def test_multirun_writes_networks_where_tables_read_them(tmp_path, monkeypatch):
     seen = []
     monkeypatch.chdir(tmp_path)
