@@ -38,7 +38,7 @@ def cast(T_world_lidar: Float[Tensor, "4 4"], projection: SphericalProjection = 
 
 
 class BoxSequence(Sequence):
-    """A drive through the hall, back and forth at a varying speed, scans made when asked for."""
+    """A drive through the hall, back and forth at a varying speed; scans are computed on access."""
 
     def __init__(self, name: str, frames: int, truth: bool = True) -> None:
         self.name = name
@@ -63,7 +63,7 @@ class BoxSequence(Sequence):
 
 
 class BoxDrives(DataSet):
-    """Sequences "0", "1", ...; those in `without_truth` have no poses to tell."""
+    """Sequences "0", "1", ...; those in `without_truth` have no ground truth."""
 
     def __init__(
         self,

@@ -7,5 +7,5 @@ _SKIP = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA d
 
 
 def on_gpu(test):
-    """Run a test on machines with a GPU alone."""
+    """Skip a test on machines without a GPU."""
     return pytest.mark.gpu(_SKIP(test))

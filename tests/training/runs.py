@@ -57,21 +57,21 @@ def configured(run_dir: Path, *overrides: str, draws: bool = False, **drives) ->
 
 
 def curves(run_dir: Path) -> dict[str, list[tuple[int, float]]]:
-    """Every scalar curve of a run as (step, value)."""
+    """The scalar curves of a run as (step, value), by name."""
     events = EventAccumulator(str(run_dir))
     events.Reload()
     return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
 
 
 def images(run_dir: Path) -> dict[str, list[int]]:
-    """The epochs of which a run shows each of its images and figures, by name."""
+    """The epochs at which a run logged each of its images and figures, by name."""
     events = EventAccumulator(str(run_dir))
     events.Reload()
     return {tag: [e.step for e in events.Images(tag)] for tag in events.Tags()["images"]}
 
 
 def predicted(checkpoint: Path, sequence: Sequence) -> Float[Tensor, "n 4 4"]:
-    """The poses of a drive as the network of a checkpoint predicts them."""
+    """The poses of a drive, predicted by the network of a checkpoint."""
     module = PoseNetModule.load_from_checkpoint(checkpoint)
     maps = torch.stack([decode(encode(module.projection.vertex_map(scan.points))) for scan in sequence])
     return se3.accumulate(module.relative_pose(maps[:-1], maps[1:]))

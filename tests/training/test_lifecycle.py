@@ -1,4 +1,4 @@
-"""A training from its first step to the checkpoint alone, on a tiny world."""
+"""Trainings on a tiny world: run folders, checkpoints, resuming."""
 
 import pytest
 import torch
@@ -43,9 +43,9 @@ def test_run_folder_holds_checkpoints_config_revision_and_events(run):
 
 def test_loss_falls(run):
     folder, _, loss = run
-    # The supervised loss has no lower bound to fall towards: its squared error has.
-    what = "translation_squared_m2" if loss == "supervised" else "loss"
-    losses = [value for _, value in curves(folder)[f"train/{what}_epoch"]]
+    # The supervised loss is not bounded below, its squared error is.
+    tag = "translation_squared_m2" if loss == "supervised" else "loss"
+    losses = [value for _, value in curves(folder)[f"train/{tag}_epoch"]]
     assert len(losses) == EPOCHS
     assert min(losses[1:]) < 0.9 * losses[0]
 
@@ -217,7 +217,6 @@ def test_resident_maps_give_same_losses(tmp_path, capsys):
     assert capsys.readouterr().out.count("vertex maps to cpu: 18 scans") == 1
 
 
-@pytest.mark.slow
 def test_same_seed_gives_same_losses(tmp_path):
     losses = []
     for name in ("a", "b"):
@@ -227,7 +226,6 @@ def test_same_seed_gives_same_losses(tmp_path):
     assert losses[0] == losses[1]
 
 
-@pytest.mark.slow
 def test_misfit_selects_best_checkpoint_without_ground_truth(tmp_path):
     config = configured(tmp_path / "run", "trainer.max_epochs=1", frames=9, without_truth=["0", "2"])
     best = train(config, data_name="boxes")
