@@ -1,6 +1,6 @@
-"""A device beside the CPU on any machine: it computes on the CPU, but takes no operand from there, as a GPU would not.
+"""A second device on machines without a GPU: it computes on the CPU but, like a GPU, refuses tensors of the CPU.
 
-It shows that nothing is left on the wrong device, and how many kernels and transfers a GPU would be asked for.
+It shows that all tensors are on the right device, and counts the kernels and transfers that a GPU would need.
 """
 
 import contextlib
@@ -16,19 +16,19 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 NAME = "pretend"
 IS_SUPPORTED = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")  # in recent torch
 _COPIES, _INDEXES = {"_to_copy", "copy_"}, {"index", "index_put_"}
-_TO_THE_CPU = {"_local_scalar_dense", "equal"}
+_TO_CPU = {"_local_scalar_dense", "equal"}
 _WAITS = {"nonzero", "_unique2"}  # the size of the result must be known
 _VIEWS = {"alias", "detach", "diagonal", "expand", "permute", "select", "slice", "split", "squeeze", "t", "transpose",
           "unbind", "unsqueeze", "view"}  # fmt: skip
 
 
-class Elsewhere(Tensor):
+class DeviceTensor(Tensor):
     """A tensor of the pretended device."""
 
     inner: Tensor
 
     @staticmethod
-    def __new__(cls, inner: Tensor) -> "Elsewhere":
+    def __new__(cls, inner: Tensor) -> "DeviceTensor":
         """Wrap a tensor of the CPU."""
         size, strides, offset = inner.size(), inner.stride(), inner.storage_offset()
         wrapper = torch.Tensor._make_wrapper_subclass(
@@ -44,10 +44,10 @@ class Elsewhere(Tensor):
 
 
 class PretendDevice(TorchDispatchMode):
-    """Runs everything; counts what the device would be asked for.
+    """Runs all operations, and counts those of the device.
 
-    Args (counted):
-        launches: operations on it that are no views.
+    Attributes:
+        launches: operations on it other than views.
         transfers: copies to and from it, and sizes that the CPU waits for.
     """
 
@@ -58,34 +58,34 @@ class PretendDevice(TorchDispatchMode):
         """Run an operation on the tensors within."""
         kwargs, name = dict(kwargs or {}), func.overloadpacket.__name__
         operands = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
-        there = [operand for operand in operands if isinstance(operand, Elsewhere)]
-        strangers = [operand for operand in operands if not isinstance(operand, Elsewhere) and operand.dim()]
-        may_mix = name in _COPIES or (name in _INDEXES and isinstance(args[0], Elsewhere))  # as on a GPU
-        if there and strangers and not may_mix:
+        on_device = [operand for operand in operands if isinstance(operand, DeviceTensor)]
+        on_cpu = [operand for operand in operands if not isinstance(operand, DeviceTensor) and operand.dim()]
+        may_mix = name in _COPIES or (name in _INDEXES and isinstance(args[0], DeviceTensor))  # as on a GPU
+        if on_device and on_cpu and not may_mix:
             raise RuntimeError(f"{func} takes tensors of two devices")
-        is_there = bool(there) and name not in _TO_THE_CPU
+        to_device = bool(on_device) and name not in _TO_CPU
         if kwargs.get("device") is not None:
-            is_there = torch.device(kwargs["device"]).type == NAME
+            to_device = torch.device(kwargs["device"]).type == NAME
             kwargs["device"] = torch.device("cpu")
         if name == "copy_":
-            is_there = isinstance(args[0], Elsewhere)
+            to_device = isinstance(args[0], DeviceTensor)
         is_mask = name in _INDEXES and any(operand.dtype == torch.bool for operand in operands[1:])
-        self._count(name, bool(there), is_there, bool(strangers), waits=is_mask or name in _WAITS)
-        wrappers = {id(tensor.inner): tensor for tensor in there}
-        result = func(*tree_map_only(Elsewhere, _inner, args), **tree_map_only(Elsewhere, _inner, kwargs))
-        if not is_there:
+        self._count(name, bool(on_device), to_device, bool(on_cpu), waits=is_mask or name in _WAITS)
+        wrappers = {id(tensor.inner): tensor for tensor in on_device}
+        result = func(*tree_map_only(DeviceTensor, _inner, args), **tree_map_only(DeviceTensor, _inner, kwargs))
+        if not to_device:
             return result
-        return tree_map_only(Tensor, lambda t: wrappers[id(t)] if id(t) in wrappers else Elsewhere(t), result)
+        return tree_map_only(Tensor, lambda t: wrappers[id(t)] if id(t) in wrappers else DeviceTensor(t), result)
 
-    def _count(self, name: str, was_there: bool, is_there: bool, has_strangers: bool, waits: bool) -> None:
-        is_copy = name in _COPIES and (was_there != is_there or has_strangers)
-        if (was_there and (waits or name in _TO_THE_CPU)) or is_copy:
+    def _count(self, name: str, from_device: bool, to_device: bool, from_cpu: bool, waits: bool) -> None:
+        is_copy = name in _COPIES and (from_device != to_device or from_cpu)
+        if (from_device and (waits or name in _TO_CPU)) or is_copy:
             self.transfers += 1
-        elif (was_there or is_there) and name not in _VIEWS:
+        elif (from_device or to_device) and name not in _VIEWS:
             self.launches += 1
 
 
-def _inner(tensor: Elsewhere) -> Tensor:
+def _inner(tensor: DeviceTensor) -> Tensor:
     return tensor.inner
 
 

@@ -11,7 +11,7 @@ RECORDS = [
 ]
 
 
-def test_one_row_per_frame_with_every_field(tmp_path):
+def test_csv_has_one_row_per_frame_with_every_field(tmp_path):
     write_health(tmp_path / "04.health.csv", RECORDS)
     with (tmp_path / "04.health.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -38,5 +38,5 @@ def test_one_row_per_frame_with_every_field(tmp_path):
         (Health(0, converged=False), False),  # a step above a millimetre after thirty is no reason for doubt
     ],
 )
-def test_what_is_flagged(record, flagged):
+def test_health_flags_unreliable_frames(record, flagged):
     assert record.flagged == flagged

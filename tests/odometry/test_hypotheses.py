@@ -11,7 +11,7 @@ def contains(motions: torch.Tensor, wanted: torch.Tensor) -> bool:
     return bool(torch.isclose(motions, wanted).all(dim=(-1, -2)).any())
 
 
-def test_the_start_tries_standing_driving_and_turning():
+def test_start_motions_cover_standing_driving_and_turning():
     motions = start_motions(se3.identity())
     assert contains(motions, se3.identity())
     xi = se3.log(motions)
@@ -21,12 +21,12 @@ def test_the_start_tries_standing_driving_and_turning():
     assert forward.diff().max() <= 1.0  # no speed is farther from a hypothesis than ICP pulls in
 
 
-def test_the_start_tries_the_guess_too_but_nothing_twice():
+def test_start_motions_include_guess_once():
     assert contains(start_motions(GUESS), GUESS)
     assert len(start_motions(GUESS)) == len(start_motions(se3.identity())) + 1
 
 
-def test_a_surprise_tries_the_guess_the_last_motion_a_lost_and_a_repeated_scan():
+def test_surprise_motions_cover_lost_and_repeated_scans():
     motions = surprise_motions(GUESS, FORWARD)
     for wanted in (GUESS, FORWARD, FORWARD @ FORWARD, se3.identity()):
         assert contains(motions, wanted)

@@ -12,7 +12,7 @@ JUDGEMENT = Judgement(max_deviation_m=0.5, max_deviation_deg=8.0, min_gain=0.1)
 def registered(
     overlap: float = 1.0, inlier_share: float = 1.0, fit: float = 1.0, information: float = 1.0
 ) -> RegistrationResult:
-    """A registration of which only these are known."""
+    """A registration with these shares, and nothing else."""
     shares = (torch.tensor(share) for share in (overlap, inlier_share, fit))
     nothing, of_each_axis = torch.zeros(6), torch.full((3,), information)
     return RegistrationResult(
@@ -28,7 +28,7 @@ def registered(
     )
 
 
-def test_a_motion_follows_another_if_both_its_changes_are_small():
+def test_motion_is_plausible_if_both_changes_are_small():
     assert JUDGEMENT.is_plausible(MotionDifference(0.5, 8.0))
     assert not JUDGEMENT.is_plausible(MotionDifference(0.51, 0.0))
     assert not JUDGEMENT.is_plausible(MotionDifference(0.0, 8.1))
@@ -44,19 +44,19 @@ def test_a_motion_follows_another_if_both_its_changes_are_small():
         (MotionDifference(2.2, 30.0), 0.1),  # a scan may have been lost, or the sensor been turned by hand
     ],
 )
-def test_a_change_of_motion_must_agree_better_in_proportion_and_by_no_more_than_the_gain(deviation, price):
+def test_credibility_falls_with_deviation_up_to_min_gain(deviation, price):
     assert JUDGEMENT.credibility(0.6, deviation) == pytest.approx(0.6 - price)
 
 
 @pytest.mark.parametrize(
     ("overlap", "inlier_share", "accepted"), [(0.5, 0.9, True), (0.02, 0.9, False), (0.5, 0.5, False)]
 )
-def test_what_overlaps_the_map_and_lies_on_it_is_accepted(overlap, inlier_share, accepted):
+def test_registration_needs_overlap_and_inliers(overlap, inlier_share, accepted):
     assert Judgement().accepts(registered(overlap, inlier_share)) == accepted
 
 
 @pytest.mark.parametrize(("fit", "information", "dropped"), [(0.6, 0.04, False), (0.3, 0.1, True), (0.6, 0.02, True)])
-def test_a_registration_has_dropped_if_it_says_much_less_than_the_best_of_the_last(fit, information, dropped):
+def test_has_dropped_compares_with_best_of_last_results(fit, information, dropped):
     judgement = Judgement(min_fit_share=0.7, min_information_share=0.3)
     last = [registered(fit=0.5, information=0.1), registered(fit=0.6, information=0.01)]
     result = registered(fit=fit, information=information)
@@ -64,6 +64,6 @@ def test_a_registration_has_dropped_if_it_says_much_less_than_the_best_of_the_la
 
 
 @pytest.mark.parametrize("setting", ["max_deviation_m", "max_deviation_deg"])
-def test_changes_of_motion_that_are_plausible_have_a_size(setting):
+def test_max_deviation_of_zero_is_refused(setting):
     with pytest.raises(ValueError, match=f"must be above 0.*{setting}=0"):
         Judgement(**{setting: 0.0})

@@ -14,7 +14,7 @@ def pose(x: float, yaw_deg: float = 0.0) -> Tensor:
 
 
 class Recorder(KdTree):
-    """Remembers what was inserted."""
+    """Records the poses and window sizes of insertions."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class Recorder(KdTree):
 POINT = torch.tensor([[5.0, 0.0, 0.0]])
 
 
-def test_every_scan_is_added_by_default_and_the_window_slides():
+def test_every_scan_is_added_and_window_slides():
     searchable = Recorder()
     local_map = LocalMap(searchable, size=3)
     for i in range(6):
@@ -38,7 +38,7 @@ def test_every_scan_is_added_by_default_and_the_window_slides():
     assert found.mask.tolist() == [False, False, False, True, True, True]
 
 
-def test_a_size_of_one_is_the_previous_scan():
+def test_map_of_size_one_holds_previous_scan():
     local_map = LocalMap(Recorder(), size=1)
     local_map.update(POINT, pose(0.0))
     local_map.update(POINT, pose(10.0))
@@ -46,7 +46,7 @@ def test_a_size_of_one_is_the_previous_scan():
     assert local_map.association.search(POINT + torch.tensor([10.0, 0, 0]), 1.0).mask.tolist() == [True]
 
 
-def test_key_frames_are_taken_by_distance_or_by_angle_since_the_last_one():
+def test_key_frames_by_distance_or_angle_since_last():
     searchable = Recorder()
     local_map = LocalMap(searchable, key_frame_distance_m=1.0, key_frame_angle_deg=10.0)
     for x, yaw in [(0.0, 0.0), (0.6, 0.0), (0.9, 9.0), (1.1, 0.0), (1.2, 12.0), (1.3, 3.0), (1.3, 1.0)]:
@@ -58,7 +58,7 @@ def test_key_frames_are_taken_by_distance_or_by_angle_since_the_last_one():
     ("setting", "kept"),
     [({"key_frame_distance_m": 1.0}, [0.0, 1.1, 2.2]), ({"key_frame_angle_deg": 10.0}, [0.0, 1.2])],
 )
-def test_key_frames_by_one_criterion_alone(setting, kept):
+def test_key_frames_by_distance_or_angle_alone(setting, kept):
     searchable = Recorder()
     local_map = LocalMap(searchable, **setting)
     for x, yaw in [(0.0, 0.0), (0.6, 0.0), (1.1, 9.0), (1.2, 12.0), (2.2, 12.0)]:
@@ -66,7 +66,7 @@ def test_key_frames_by_one_criterion_alone(setting, kept):
     assert [x for x, _ in searchable.inserted] == kept
 
 
-def test_a_restarted_map_takes_the_next_scan_whatever_the_key_frames():
+def test_restarted_map_takes_next_scan_as_key_frame():
     searchable = Recorder()
     local_map = LocalMap(searchable, key_frame_distance_m=100.0, key_frame_angle_deg=100.0)
     local_map.update(POINT, pose(0.0))
@@ -76,6 +76,6 @@ def test_a_restarted_map_takes_the_next_scan_whatever_the_key_frames():
     assert [x for x, _ in searchable.inserted] == [0.0, 1.0]
 
 
-def test_a_window_needs_a_scan():
+def test_map_size_of_zero_is_refused():
     with pytest.raises(ValueError, match=r"local_map\.size must be at least 1"):
         LocalMap(KdTree(), size=0)

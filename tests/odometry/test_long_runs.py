@@ -1,4 +1,4 @@
-"""However long a drive, an odometry holds its window and nothing more."""
+"""The memory of an odometry is bounded by its window, however long the drive."""
 
 import resource
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from lidarlearn.odometry.base import BaseOdometry, Frame
 from lidarlearn.simulation.drive import Drive
 from lidarlearn.simulation.sensors import Sensor
 from tests import scenes
-from tests.odometry.odometries import build, kd_at_least, scans_of
+from tests.odometry.odometries import build, kd_fast_others_slow, scans_of
 
 TINY = Sensor("tiny", tuple(np.linspace(20, -25, 32).tolist()), 96)
 TINY_IMAGE = [
@@ -32,7 +32,7 @@ def loop() -> Drive:
 
 
 def looping(odometry: BaseOdometry, count: int) -> Iterator[Frame]:
-    """The frames of an endless drive; on the way it must never be lost."""
+    """The frames of an endless drive, each checked."""
     tiny, true = scans_of(loop()), loop().T_world_lidar
     previous = se3.identity()
     for i in range(count):
@@ -60,17 +60,18 @@ def held_bytes(thing: object, seen: set[int]) -> int:
     return held_bytes(vars(thing), seen) if hasattr(thing, "__dict__") else 0
 
 
-@kd_at_least
-def test_what_an_odometry_holds_stops_growing_when_its_window_is_full(association):
+@kd_fast_others_slow
+def test_memory_stops_growing_when_window_is_full(association):
     odometry = build(f"cv+{association}_f2m", f"odometry.{association}_f2m.local_map.size=3", *TINY_IMAGE)
-    held = [held_bytes(odometry, set()) for _ in looping(odometry, 40)]
-    assert max(held[20:]) <= 1.02 * max(held[:20])
+    held = [held_bytes(odometry, set()) for _ in looping(odometry, 16)]
+    one_scan = 12 * TINY.beams * TINY.columns
+    assert max(held[8:]) - max(held[:8]) < 2 * one_scan
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("association", ["kd", "p"])
-def test_memory_is_flat_over_3000_frames(association):
-    """A minute long. The voxel hash keeps the very map that the KdTree is built of."""
+def test_process_memory_is_flat_over_3000_frames(association):
+    """The voxel hash keeps the same map as the KdTree."""
     odometry = build(f"cv+{association}_f2m", *TINY_IMAGE)
     after_1000 = 0
     for frame in looping(odometry, 3_000):

@@ -1,4 +1,4 @@
-"""Backends that are built in Python are those of the configs."""
+"""Backends and odometries that are built in Python equal those of the configs."""
 
 from pathlib import Path
 from typing import Any
@@ -9,13 +9,14 @@ from torch import Tensor
 
 import lidarlearn
 from lidarlearn.geometry.projection import SphericalProjection
-from lidarlearn.odometry import Odometry, presets
+from lidarlearn.odometry import Backend, GridSampling, LocalMap, Odometry, presets
 from lidarlearn.odometry.initialization import ConstantVelocity
-from tests.odometry.odometries import ASSOCIATIONS, composed, scans
+from lidarlearn.registration.association import KdTree
+from tests.odometry.odometries import ASSOCIATIONS, build, configured, street_scans
 
 
 def contents(value: Any) -> Any:
-    """All that an object consists of, down to what can be compared; tensors have yet to be filled."""
+    """The attributes of an object, down to values that can be compared; of tensors, which are empty, the shape."""
     if isinstance(value, Tensor):
         return value.dtype, value.device, value.shape
     if isinstance(value, dict):
@@ -28,21 +29,25 @@ def contents(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("association", ASSOCIATIONS)
-@pytest.mark.parametrize(("projection", "device"), [("hdl64", "cpu"), ("vlp16", "cpu"), ("vlp16", "meta")])
-def test_a_preset_is_what_its_yaml_makes(association, projection, device):
-    config = composed(f"projection@data.projection={projection}", f"device={device}")
-    sensor, build = instantiate(config.data.projection), getattr(presets, f"{association}_f2m")
-    f2m, f2f = (contents(build(sensor, device=device, **size)) for size in ({}, {"size": 1}))
+@pytest.mark.parametrize(("projection", "device"), [("hdl64", "cpu"), ("vlp16", "meta")])
+def test_preset_equals_config(association, projection, device):
+    config = configured(f"device={device}", projection=projection)
+    sensor, preset = instantiate(config.data.projection), getattr(presets, f"{association}_f2m")
+    f2m, f2f = (contents(preset(sensor, device=device, **size)) for size in ({}, {"size": 1}))
     assert f2m == contents(instantiate(config.odometry[f"{association}_f2m"])) != f2f
     assert f2f == contents(instantiate(config.odometry[f"{association}_f2f"]))
 
 
-def test_so_is_an_odometry_around_it():
-    parts = ConstantVelocity(), presets.kd_f2m(SphericalProjection())
-    assert contents(Odometry(*parts)) == contents(instantiate(composed().pipeline)(*parts))
+@pytest.mark.parametrize(
+    "backend",
+    [lambda: presets.kd_f2m(SphericalProjection()), lambda: Backend(GridSampling(), LocalMap(KdTree()))],
+    ids=["preset", "defaults"],
+)
+def test_odometry_in_python_equals_cv_kd_f2m(backend):
+    assert contents(Odometry(ConstantVelocity(), backend())) == contents(build("cv+kd_f2m"))
 
 
-def test_what_the_readme_shows_runs_as_printed(capsys):
+def test_python_example_of_readme_runs(capsys):
     readme = (Path(lidarlearn.__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    exec(readme.partition("```python\n")[2].partition("```")[0], {"scans": scans()[:3]})
+    exec(readme.partition("```python\n")[2].partition("```")[0], {"scans": street_scans()[:3]})
     assert capsys.readouterr().out.count("False") == 3
