@@ -87,18 +87,18 @@ def test_point_to_point_converges(name, association):
 
 @all_associations
 def test_batch_equals_single_registrations(association):
-    scene, grid = maps.scene("room", association), 0.3 * maps.planar_grid()[1:5]
+    scene, grid = maps.scene("room", association), 0.3 * maps.planar_grid()[[2, 14]]
     gauss_newton = solver(association, translation_tolerance_m=1e-5, rotation_tolerance_deg=1e-4)
-    batch = register(gauss_newton, scene, grid.view(2, 2, 6))
-    assert batch.T_world_lidar.shape == (2, 2, 4, 4) and batch.converged.shape == (2, 2)
-    assert batch.hessian.shape == (2, 2, 6, 6) and batch.weakest_direction.shape == (2, 2, 3)
+    batch = register(gauss_newton, scene, grid.view(1, 2, 6))
+    assert batch.T_world_lidar.shape == (1, 2, 4, 4) and batch.converged.shape == (1, 2)
+    assert batch.hessian.shape == (1, 2, 6, 6) and batch.weakest_direction.shape == (1, 2, 3)
     for i, perturbation in enumerate(grid):
         single = register(gauss_newton, scene, perturbation)
-        T = batch.T_world_lidar.view(4, 4, 4)[i]
+        T = batch.T_world_lidar[0, i]
         distance, angle = maps.errors(T, single.T_world_lidar)
         assert distance < 2e-4 and angle < 2e-3
         for name in ("overlap", "inlier_share", "fit"):
-            assert getattr(batch, name).view(4)[i].item() == pytest.approx(getattr(single, name).item(), abs=0.01)
+            assert getattr(batch, name)[0, i].item() == pytest.approx(getattr(single, name).item(), abs=0.01)
 
 
 @all_associations
