@@ -84,7 +84,7 @@ class SimulatedDataSet(DataSet):
         train_sequences: names of the sequences to train on.
         val_sequences: names of the sequences that select the best checkpoint.
         test_sequences: names of the sequences to evaluate.
-        frames: number of scans of a drive.
+        frames: number of scans of a generated drive; a `pose_file` is followed to its end.
         seed: of all drives.
         speed: constant speed from the first scan on [m/s]; None for speeds that are usual in the world.
         static: leave out everything that moves.
@@ -202,7 +202,7 @@ class SimulatedDataSet(DataSet):
         return Drive(
             match[1],
             seed=100_000 * self.seed + int(match[2]),
-            frames=self.frames,
+            frames=self.frames if poses is None else len(poses),
             sensor=self.sensor,
             speed=self.speed,
             static=self.static,

@@ -163,9 +163,10 @@ def test_distorted_scans_have_point_times(tmp_path):
 
 
 def test_pose_file_sets_trajectory(tmp_path):
-    poses = scenes.straight_path(5, 1.38)
+    poses = scenes.straight_path(9, 1.38)
     np.savetxt(tmp_path / "04.txt", poses[:, :3].reshape(-1, 12))
     data_set = _data_set(tmp_path, pose_file=tmp_path / "04.txt", pose_file_frame="lidar", max_frames=1, **ONLY_TRAIN)
+    assert len(data_set._drive("urban_00")) == 9 > data_set.frames
     assert data_set._drive("urban_00").T_world_lidar[3, :3, 3].tolist() == pytest.approx([3 * 1.38, 0, 0])
 
 
