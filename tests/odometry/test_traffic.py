@@ -23,7 +23,7 @@ def past_lorries(step_m: float, lorry_step_m: float) -> Drive:
 
 @pytest.mark.parametrize("association", ASSOCIATIONS)
 @pytest.mark.parametrize("map_", ["f2m", pytest.param("f2f", marks=slow)])
-def test_slow_lorries_beside_the_sensor_do_not_pull_its_pose(association, map_):
+def test_slow_lorries_do_not_pull_the_pose(association, map_):
     """They move too little from scan to scan for the search distance to exclude them."""
     drive = past_lorries(0.6, lorry_step_m=0.3)
     frames = run(build(f"cv+{association}_{map_}"), scans_of(drive))
