@@ -34,7 +34,7 @@ class GaussNewton:
         max_iterations: largest number of steps.
         search_distance_m: final search distance for correspondences [m].
         narrowing: factor of the search distance from one iteration to the next, until it is `search_distance_m`; the
-            scale of the robust weight narrows with it (graduated non-convexity, Blake & Zisserman 1987).
+            scale of the robust weight narrows with its square (graduated non-convexity, Blake & Zisserman 1987).
         coarse_stride: every n-th point is used while the search distance is wider than `search_distance_m`.
         min_information: along directions with less `RegistrationResult.information` than this, the position keeps its
             initial value. Source: after Zhang, Kaess & Singh, "On degeneracy of optimization-based

@@ -44,7 +44,8 @@ class Matching:
     Args:
         residual: what is minimized.
         weight: the robust weight.
-        search_distance_m: the final search distance [m]. While the search is wider, so is the scale of the weight.
+        search_distance_m: the final search distance [m]. While the search is wider, the scale of the weight is wider by
+            the square of the ratio.
         association: the map.
     """
 
@@ -116,7 +117,8 @@ class Matching:
         residuals, offsets = augmented_jacobians[..., 6], points_world - map_points
         is_distance = residuals.shape[-1] == 1
         size = residuals[..., 0].abs() if is_distance else residuals.norm(dim=-1)
-        widening = distance_m / self.search_distance_m  # a narrow kernel would keep what is near by chance
+        # A narrow kernel would keep what is near by chance. Squared, it includes residuals as large as the distance.
+        widening = (distance_m / self.search_distance_m) ** 2
         squared_distances = offsets.square().sum(-1)
         if isinstance(distance_m, Tensor):
             mask = mask & (squared_distances <= distance_m**2)
